@@ -10,8 +10,8 @@ from typer import Option
 
 from ..core.terminal import print_line
 from .choices import choice
-from .options import Config, Json, Quiet, Threads, set_option
-from .tables import Rows, print_json
+from .options import Config, Json, Quiet, TableFile, Threads, set_option
+from .tables import Rows, print_json, write_rows
 from .workers import long_work
 
 app = typer.Typer()
@@ -39,6 +39,7 @@ def align_command(
     out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_align"),
     resume: Annotated[bool, Option("--resume", help="Go on with the visits in the folder.")] = False,
     settings: Annotated[list[str] | None, set_option("align")] = None,
+    table: TableFile = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -86,12 +87,13 @@ def align_command(
         alignment = align(align_config, folder=folder, store=out, execution=execution)
     write_alignment(alignment, out)
     summary = alignment_summary(alignment)
+    rows = _state_rows(summary, verdict(summary))
+    write_rows(rows, table)
     if as_json:
         print_json(summary)
         return
     if not quiet:
-        print_line(verdict(summary))
-        _show(summary)
+        rows.show()
     print_line(f"alignment: {out.resolve()}")
 
 
@@ -99,7 +101,8 @@ def align_command(
 _NO_IMAGES = ("",) * 4
 
 
-def _show(summary: dict[str, Any]) -> None:
+def _state_rows(summary: dict[str, Any], sentence: str) -> Rows:
+    """Return wavefront and images of the telescope as designed, at the floor, and in late visits."""
     rows = [
         (
             "as designed",
@@ -136,4 +139,4 @@ def _show(summary: dict[str, Any]) -> None:
         "rms g [1e-3]",
         "rms e [1e-3]",
     )
-    Rows(headings, rows, _CAPTION).show()
+    return Rows(headings, rows, _CAPTION, verdict=sentence)

@@ -43,7 +43,12 @@ def baseline_save(
     model: Model,
     out: Annotated[Path, Option("--out", "-o", help="Baseline to write, NAME.baseline.json.")],
     config: Annotated[
-        Path | None, Option(metavar="RUN.yaml", help="Run configuration: adds heights, PSFs, a PSF model.")
+        Path | None,
+        names(
+            completion.files(*completion.YAML),
+            metavar="RUN.yaml",
+            help="Run configuration, by its file: adds heights, PSFs, a PSF model.",
+        ),
     ] = None,
     field_deg: FieldsDeg = None,
     wavelength_nm: WavelengthsNm = None,
@@ -58,10 +63,15 @@ def baseline_save(
     ] = None,
     tolerance: Annotated[
         list[str] | None,
-        Option(metavar="TEXT", help="Tolerance: '1 %' of all values, or 'spot rms = 0.1 um'; again for more."),
+        names(
+            completion.metrics,
+            metavar="TEXT",
+            help="Tolerance: '1 %' of all values, or 'spot rms = 0.1 um'; again for more.",
+        ),
     ] = None,
     limit: Annotated[
-        list[str] | None, Option(metavar="TEXT", help="Requirement: 'spot rms < 10 um'; again for more.")
+        list[str] | None,
+        names(completion.metrics, metavar="TEXT", help="Requirement: 'spot rms < 10 um'; again for more."),
     ] = None,
     threads: Threads = None,
     as_json: Json = False,
@@ -146,7 +156,14 @@ def check_command(
         str | None,
         names(completion.models, metavar="MODEL", help="Telescope in place of the baseline's own: bundled, or a path."),
     ] = None,
-    config: Annotated[Path | None, Option(metavar="RUN.yaml", help="Run configuration in place of its own.")] = None,
+    config: Annotated[
+        Path | None,
+        names(
+            completion.files(*completion.YAML),
+            metavar="RUN.yaml",
+            help="Run configuration, by its file, in place of its own.",
+        ),
+    ] = None,
     everything: Annotated[bool, Option("--all", help="Show all metrics, not the worst alone.")] = False,
     threads: Threads = None,
     as_json: Json = False,

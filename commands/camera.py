@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 from typer import Argument
 
+from ..core.errors import ConfigError
 from ..core.file_names import file_name
 from ..core.terminal import print_line
 from . import completion
 from .choices import names
+from .completion import YAML
 from .inputs import configured_experiment, warnings_shown
-from .options import Json, NoPicture, Picture, TableFile, check_table, picture_kind
+from .options import Json, NoPicture, Picture, Settings, TableFile, picture_kind
 from .tables import Rows, print_json
+from .verdicts import counted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,6 +42,7 @@ def camera_command(
             kind=Argument,
         ),
     ] = "lsstcam",
+    settings: Settings = None,
     picture: Picture = None,
     no_picture: NoPicture = False,
     table: TableFile = None,
@@ -55,15 +59,19 @@ def camera_command(
     - `pachon camera`: heights of LSSTCam as built
     - `pachon camera metrology.fits --picture heights.pdf`
     - `pachon camera pachon_run/config.yaml --json`
+    - `pachon camera pachon_run/config.yaml --set focal_plane.ccd=false`: without heights of single CCDs
     """
     from ..core.files import write_bytes
     from ..core.plotting import picture_bytes
 
     kind = picture_kind(picture)
-    check_table(table)
     drawn = not no_picture and (picture is not None or not as_json)
     camera = _listed_camera(heights)
-    rows, content, draw = _listed(camera) if camera is not None else _heights(heights)
+    if settings and Path(heights).suffix.lower() not in YAML:
+        raise ConfigError(f"--set: expected a configuration in place of {heights}, whose keys it sets")
+    if settings and camera is not None:
+        raise ConfigError(f"--set: expected a configuration, whose keys it sets; {heights} is a camera")
+    rows, content, draw = _listed(camera) if camera is not None else _heights(heights, settings or ())
     name = file_name(camera.name if camera is not None else Path(heights).stem)
     files = {}
     if drawn:
@@ -104,11 +112,13 @@ def _listed(camera: Camera) -> _Content:
     rows = camera_rows(camera)
     ccds = [dict(zip(CAMERA_COLUMNS, row, strict=True)) for row in rows]
     content = {"camera": camera.name, "pixel_um": round(camera.pixel_size * 1e6, 9), "ccds": ccds}
-    table = Rows(CAMERA_COLUMNS, [[str(cell) for cell in row] for row in rows], CAMERA_CAPTION)
+    side = f"{camera.pixel_size * 1e6:.4g} µm"
+    verdict = f"{camera.name} has {counted(len(camera), 'CCD')} with pixels of {side}."
+    table = Rows(CAMERA_COLUMNS, [[str(cell) for cell in row] for row in rows], CAMERA_CAPTION, verdict=verdict)
     return table, content, lambda: camera_plot(camera)
 
 
-def _heights(heights: str) -> _Content:
+def _heights(heights: str, settings: Sequence[str]) -> _Content:
     """Return the statistics of heights as a table and for JSON, and the function that draws a map."""
     from dataclasses import asdict
 
@@ -116,22 +126,27 @@ def _heights(heights: str) -> _Content:
     from ..pipeline.report.height_plots import vendor_heights_plot
     from ..pipeline.report.tables import HEIGHT_CAPTION, HEIGHT_COLUMNS, height_rows
 
-    plane = _focal_plane(heights)
+    plane = _focal_plane(heights, settings)
     statistics = height_statistics(plane)
     residual = None if plane.residual is None else dict(zip(plane.names, plane.residual, strict=True))
     metrics = {name: asdict(group) for name, group in statistics.items()}
     content = {"heights": heights, "statistics_m": metrics, "fit_residual_m": residual}
     title = f"CCD heights: {Path(heights).stem}"
-    table = Rows(HEIGHT_COLUMNS, height_rows(statistics), HEIGHT_CAPTION)
+    together = statistics["all"]
+    verdict = (
+        f"The heights of {counted(together.n_ccd, 'CCD')} have {1e6 * together.rms:.3g} µm rms; 95 % of them lie "
+        f"within {1e6 * together.width95:.3g} µm."
+    )
+    table = Rows(HEIGHT_COLUMNS, height_rows(statistics), HEIGHT_CAPTION, verdict=verdict)
     return table, content, lambda: vendor_heights_plot(plane, title)
 
 
-def _focal_plane(heights: str) -> FocalPlane:
+def _focal_plane(heights: str, settings: Sequence[str]) -> FocalPlane:
     from ..core.errors import HeightWarning
     from ..models.camera.cameras import load_camera
     from ..pipeline.experiment import measured_focal_plane
 
-    if Path(heights).suffix.lower() in (".yaml", ".yml"):
-        return configured_experiment(Path(heights)).focal_plane
+    if Path(heights).suffix.lower() in YAML:
+        return configured_experiment(Path(heights), settings).focal_plane
     with warnings_shown(HeightWarning):
         return measured_focal_plane(heights, load_camera("lsst"))

@@ -36,7 +36,9 @@ _UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "
 app = typer.Typer(
     name="pachon",
     cls=HelpGroup,
-    help="Ray-traced telescope wavefronts, turbulent atmospheres and PSF reconstruction.",
+    help="Ray-traced telescope wavefronts, turbulent atmospheres and PSF reconstruction.\n\n"
+    "In every command -o is the file or folder of the product, --picture that of the picture, --table that of the "
+    "table that is printed. Products that are folders have their pictures in them.",
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )

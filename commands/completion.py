@@ -23,8 +23,10 @@ YAML = (".yaml", ".yml")
 LENSES = (*YAML, ".zmx", ".zar", ".seq", ".len", ".json", ".roa")
 #: Endings of tables of heights.
 HEIGHTS = (".ecsv", ".fits", ".csv", ".txt", ".dat")
-#: Motions and values of surfaces in addresses, such as M2.dx.
-_ADDRESSES = ("dx", "dy", "dz", "rx", "ry", "rz", "radius", "conic")
+#: Motions of surfaces in addresses, such as M2.dx.
+MOTIONS = ("dx", "dy", "dz", "rx", "ry", "rz")
+#: Motions and values of surfaces in addresses.
+_ADDRESSES = (*MOTIONS, "radius", "conic")
 
 
 def _quiet(source: Source) -> Source:
@@ -133,6 +135,26 @@ def addresses(ctx: Any) -> Iterable[str]:
     return [f"{name}.{value}" for name in _surface_names(ctx, groups=True) for value in _ADDRESSES]
 
 
+@_quiet
+def coated_surfaces(ctx: Any) -> Iterable[str]:
+    """Return the surfaces of the telescope that the command names, each with the sign behind which its value stands."""
+    return [f"{name}=" for name in _surface_names(ctx)]
+
+
+@_quiet
+def motions(ctx: Any) -> Iterable[str]:
+    """Return the motions of surfaces and groups of the telescope of an option, that of the LSST by default."""
+    names = _surface_names(ctx, groups=True, model=ctx.params.get("telescope") or "lsst_v3.3_r")
+    return [f"{name}.{motion}=" for name in names for motion in MOTIONS]
+
+
+def metrics(ctx: Any) -> Iterable[str]:
+    """Return the kinds of metrics of baselines."""
+    from .stored_names import stored_names
+
+    return stored_names()["metrics"]
+
+
 def causes(ctx: Any) -> Iterable[str]:
     """Return the causes of ellipticity."""
     from .stored_names import stored_names
@@ -197,8 +219,8 @@ def _telescope(model: str) -> dict[str, Any]:
     return _content(bundled_file(model) if model in BUNDLED else model)
 
 
-def _surface_names(ctx: Any, groups: bool = False) -> list[str]:
-    """Return the names of surfaces in the prescription of the MODEL of a command, and those of its groups."""
-    content = _telescope(ctx.params["model"])
+def _surface_names(ctx: Any, groups: bool = False, model: str | None = None) -> list[str]:
+    """Return the names of surfaces in a prescription, by default the MODEL of a command, and those of its groups."""
+    content = _telescope(model or ctx.params["model"])
     listed_surfaces = [str(surface["name"]) for surface in content["surfaces"] if "name" in surface]
     return listed_surfaces + ([str(name) for name in content.get("groups", ())] if groups else [])

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import json
+import re
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Argument
 
-from ..core.errors import UnknownNameError, nearest, shown
+from ..core.errors import UnknownNameError, shown
 from ..core.terminal import print_line
 from . import completion
 from .choices import names
 from .config_examples import EXAMPLES
 from .config_kinds import KINDS, model_of
-from .options import Json
-from .tables import Rows, plain_table, print_json, wide_console
+from .options import Json, TableFile
+from .tables import Rows, plain_table, print_json, wide_console, write_rows
 
 if TYPE_CHECKING:
     from ..core.key_descriptions import KeyDescription
 
 app = typer.Typer()
+#: Least likeness of whole keys, as difflib has it: their kinds and sections are alike often.
+_NEAR = 0.85
+#: Columns of the table of keys.
+_HEADINGS = ("key", "default", "values", "meaning")
 
 
 @app.command("config")
@@ -29,6 +35,7 @@ def config_command(
         str | None,
         names(completion.config_keys, metavar="KEY", help="Kind, section or key: run.psf.engine.", kind=Argument),
     ] = None,
+    table: TableFile = None,
     as_json: Json = False,
 ) -> None:
     """Explain the keys of configurations: type, default, choices, meaning, and an example to copy.
@@ -44,12 +51,19 @@ def config_command(
     - `pachon config sweep --json`
     """
     if key is None:
-        _show_kinds(as_json)
+        kinds = _kind_rows()
+        write_rows(kinds, table)
+        if as_json:
+            entries = {kind: {"commands": k.commands.split(", "), "text": k.text} for kind, k in KINDS.items()}
+            print_json({"kinds": entries})
+        else:
+            kinds.show()
         return
     kind, descriptions = keys_of(key)
+    write_rows(Rows(_HEADINGS, [_key_cells(description) for description in descriptions]), table)
     if as_json:
-        summaries = [description.summary() | {"example": example(description)} for description in descriptions]
-        print_json({"kind": kind, "keys": summaries})
+        summaries = [d.summary() | {"unit": unit_of(d), "example": example(d)} for d in descriptions]
+        print_json({"kind": kind, "commands": KINDS[kind].commands.split(", "), "keys": summaries})
     elif len(descriptions) == 1:
         _show_key(kind, descriptions[0])
     else:
@@ -75,21 +89,32 @@ def keys_of(text: str) -> tuple[str, list[KeyDescription]]:
     within = [d for d in descriptions if not key or d.key.startswith((f"{key}.", f"{key}[]."))]
     if exact or within:
         return kind, [*exact, *within]
-    raise UnknownNameError(f"unknown key {shown(text)}: {_nearest_keys(kind, key, [d.key for d in descriptions])}")
+    kinds = [kind] if first in KINDS else [*KINDS]
+    names: dict[str, str] = {}
+    for name in kinds:
+        for listed_key in stored_names()["keys"][name]:
+            # Keys of the run within another file are those of runs.
+            if len(kinds) == 1 or not listed_key.startswith("run."):
+                names.setdefault(listed_key, f"{name}.{listed_key}")
+    raise UnknownNameError(f"unknown key {shown(text)}: {_nearest_keys(kinds[0], key, names)}")
 
 
-def _nearest_keys(kind: str, key: str, keys: list[str]) -> str:
-    """Return the keys that are likely to be meant: those nearest, or of the same last word."""
-    last = key.rpartition(".")[2]
-    alike = [name for name in keys if name.rpartition(".")[2] == last][:3]
-    if alike:
-        return f"did you mean {' or '.join(f'{kind}.{name}' for name in alike)}?"
-    sections = {name.rpartition(".")[0] for name in keys} - {""}
-    if hint := nearest(key, [*keys, *sections, *KINDS]):
-        return hint
-    last_words = {name.rpartition(".")[2]: name for name in keys}
-    if hint := nearest(last, last_words, n=1):
-        return f"did you mean {kind}.{last_words[hint.removeprefix('did you mean ').rstrip('?')]}?"
+def _nearest_keys(kind: str, key: str, names: dict[str, str]) -> str:
+    """Return the keys that are likely to be meant: those nearest, of the same last word, or with the word in theirs."""
+    sections = {path.rpartition(".")[0]: name.rpartition(".")[0] for path, name in names.items() if "." in path}
+    paths = sections | names
+    near = get_close_matches(key.lower(), paths, n=2, cutoff=_NEAR)
+    word = key.rpartition(".")[2].lower()
+    last_words = {path: path.rpartition(".")[2].lower() for path in names}
+    if not near:
+        near = [path for path, last in last_words.items() if last == word]
+    if not near:
+        near = [path for path, last in last_words.items() if word and word in last]
+    if not near:
+        similar = get_close_matches(word, set(last_words.values()), n=1)
+        near = [path for path, last in last_words.items() if last in similar]
+    if near:
+        return f"did you mean {' or '.join(paths[path] for path in near[:3])}?"
     return f"expected a key of {kind}, which pachon config {kind} lists, or one of {', '.join(KINDS)}"
 
 
@@ -107,25 +132,33 @@ def example(description: KeyDescription) -> str | None:
     return f"{description.key}={value if isinstance(value, str) else json.dumps(value)}"
 
 
-def _show_kinds(as_json: bool) -> None:
-    if as_json:
-        print_json({"kinds": {kind: {"commands": k.commands.split(", "), "text": k.text} for kind, k in KINDS.items()}})
-        return
+def unit_of(description: KeyDescription) -> str:
+    """Return the unit of a key, which its meaning has in brackets; empty where there is none."""
+    match = re.search(r"\[((?:1/)?[A-Za-z%][^][]*)\]", description.description)
+    return match[1] if match else ""
+
+
+def _kind_rows() -> Rows:
+    """Return the kinds of configurations."""
     rows = [(kind, entry.commands, entry.text) for kind, entry in KINDS.items()]
-    Rows(("kind", "commands", "decides"), rows, "pachon config KIND lists its keys.", left=3).show()
+    return Rows(("kind", "commands", "decides"), rows, "pachon config KIND lists its keys.", left=3)
+
+
+def _key_cells(description: KeyDescription) -> tuple[str, ...]:
+    """Return key, default, values and meaning of a key."""
+    values = ", ".join(description.choices) or description.type
+    return description.key, _default_text(description), values, description.description
 
 
 def _show_keys(kind: str, descriptions: list[KeyDescription]) -> None:
     table = plain_table()
-    table.add_column("key", no_wrap=True)
-    table.add_column("default", max_width=24)
-    table.add_column("values", max_width=30)
-    table.add_column("meaning")
+    for name, width in zip(_HEADINGS, (None, 24, 30, None), strict=True):
+        table.add_column(name, max_width=width, no_wrap=name == "key")
     for description in descriptions:
-        values = ", ".join(description.choices) or description.type
-        table.add_row(description.key, _default_text(description), values, description.description)
+        table.add_row(*_key_cells(description))
     wide_console().print(table)
-    print_line(f"{len(descriptions)} keys of {kind}; a dash: open, as the meaning says. One key: pachon config KEY")
+    print_line(f"{len(descriptions)} keys of {kind}, set by pachon {KINDS[kind].commands}")
+    print_line("A dash: open, as the meaning says. One key: pachon config KEY")
 
 
 def _show_key(kind: str, description: KeyDescription) -> None:
@@ -133,6 +166,7 @@ def _show_key(kind: str, description: KeyDescription) -> None:
         ("key", f"{kind}.{description.key}"),
         ("meaning", description.description),
         ("type", "" if description.choices else description.type),
+        ("unit", unit_of(description)),
         ("choices", ", ".join(description.choices)),
         ("default", _default_text(description)),
         ("commands", KINDS[kind].commands),

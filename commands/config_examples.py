@@ -70,6 +70,7 @@ EXAMPLES: dict[str, Any] = {
     "xi_target": 1e-6,
     # The alignment loop.
     "errors.tolerances": {"M2.dz": 2},
+    "control.gain": 0.7,
     # Tolerances.
     "tolerances": [{"name": "M2.dz_um", "size": 10}],
     "field_weights": [1, 1],

@@ -20,7 +20,9 @@ class Kind(NamedTuple):
 
 #: Kinds of configurations, the first that of keys without a kind.
 KINDS = {
-    "run": Kind("pipeline.config", "Configuration", "run, attribute, study, shim", "telescope, sky and PSF models"),
+    "run": Kind(
+        "pipeline.config", "Configuration", "run, attribute, study, shim, camera", "telescope, sky and PSF models"
+    ),
     "images": Kind("imaging.config", "ImagesConfig", "images", "images of galaxies and stars"),
     "visits": Kind("studies.visits.config", "VisitsConfig", "visits", "stacks of visits to one field"),
     "night": Kind("studies.night.config", "NightConfig", "visits --list", "visits of a scheduler's list"),

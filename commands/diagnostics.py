@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Argument, Option
@@ -27,12 +27,17 @@ from .options import (
     StarStamp,
     StarX,
     StarY,
+    TableFile,
     Threads,
     TruthStars,
     name_list,
     one_name_list,
 )
-from .tables import Rows, print_json, wide_console
+from .tables import Rows, print_json, wide_console, write_rows
+from .verdicts import attribution_verdict, diagnose_verdict, piff_verdict
+
+if TYPE_CHECKING:
+    from ..reconstruction.piff.comparison import PiffComparison
 
 app = typer.Typer()
 
@@ -55,6 +60,7 @@ def diagnose_command(
     images: StarImages = None,
     min_snr: MinSnr = 20.0,
     gain: Gain = 1.0,
+    table: TableFile = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -72,17 +78,40 @@ def diagnose_command(
     - `pachon diagnose stars.fits --piff stars.piff`: Piff and ours side by side
     """
     from ..pipeline.report.diagnostics import diagnose
-    from ..pipeline.report.tables import DIAGNOSTICS_CAPTION, DIAGNOSTICS_COLUMNS, diagnostics_rows
+    from ..pipeline.report.tables import (
+        DIAGNOSTICS_CAPTION,
+        DIAGNOSTICS_COLUMNS,
+        PIFF_CAPTION,
+        PIFF_COLUMNS,
+        diagnostics_rows,
+        piff_rows,
+    )
 
     if piff is not None:
         columns = {"x": x, "y": y, "stamp": stamp, "images": images}
-        _compare(folder, piff, out, columns, {"chip": chip, "min_snr": min_snr, "gain": gain}, quiet, as_json)
+        options = {"chip": chip, "min_snr": min_snr, "gain": gain}
+        piff_comparison, written = _compare(folder, piff, out, columns, options, quiet)
+        sentence = piff_verdict(piff_comparison.models)
+        rows = Rows(PIFF_COLUMNS, piff_rows(piff_comparison.models), PIFF_CAPTION, verdict=sentence)
+        write_rows(rows, table)
+        if as_json:
+            print_json(piff_comparison.as_dict())
+        elif not quiet:
+            rows.show()
+            print_line(f"comparison: {written.resolve()}")
         return
     result = diagnose(folder, out, strict=strict)
+    rows = Rows(
+        DIAGNOSTICS_COLUMNS,
+        diagnostics_rows(result.overall),
+        DIAGNOSTICS_CAPTION,
+        verdict=diagnose_verdict(result.overall, len(result.missing)),
+    )
+    write_rows(rows, table)
     if as_json:
         print_json(result.as_dict())
         return
-    Rows(DIAGNOSTICS_COLUMNS, diagnostics_rows(result.overall), DIAGNOSTICS_CAPTION).show()
+    rows.show()
     if result.missing:
         reason = next(iter(result.missing.values()))
         wide_console().print(f"{len(result.missing)} CCDs are left out; the first: {reason}", style="bold")
@@ -96,11 +125,9 @@ def _compare(
     columns: dict[str, Any],
     options: dict[str, Any],
     quiet: bool,
-    as_json: bool,
-) -> None:
-    """Compare a model of Piff with ours at the stars of a table."""
+) -> tuple[PiffComparison, Path]:
+    """Compare a model of Piff with ours at the stars of a table; return the comparison and its folder."""
     from ..core.errors import WcsWarning
-    from ..pipeline.report.tables import PIFF_CAPTION, PIFF_COLUMNS, piff_rows
     from ..reconstruction.own_stars.star_catalogue import load_stars
     from ..reconstruction.piff.comparison import compare_with_piff
     from ..reconstruction.piff.psf import load_piff
@@ -111,11 +138,7 @@ def _compare(
             psf = load_piff(piff)
         piff_comparison = compare_with_piff(psf, *load_stars(stars, **columns), **options)
         piff_comparison.write_folder(folder)
-    if as_json:
-        print_json(piff_comparison.as_dict())
-    elif not quiet:
-        Rows(PIFF_COLUMNS, piff_rows(piff_comparison.models), PIFF_CAPTION).show()
-        print_line(f"comparison: {folder.resolve()}")
+    return piff_comparison, folder
 
 
 @app.command("attribute")
@@ -137,6 +160,7 @@ def attribute_command(
     out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_attribution"),
     truth_stars: TruthStars = None,
     observed_stars: ObservedStars = None,
+    table: TableFile = None,
     settings: Settings = None,
     threads: Threads = None,
     quiet: Quiet = False,
@@ -168,11 +192,18 @@ def attribute_command(
     with interruptible(quiet) as reporter:
         result = attribute(resolved, cause_names, threads=threads, reporter=reporter)
     write_attribution(result, out, resolved)
+    rows = Rows(
+        ATTRIBUTION_COLUMNS,
+        attribution_rows(result.metrics),
+        ATTRIBUTION_CAPTION,
+        verdict=attribution_verdict(result.metrics),
+    )
+    write_rows(rows, table)
     if as_json:
         print_json(result.metrics)
         return
     if not quiet:
-        Rows(ATTRIBUTION_COLUMNS, attribution_rows(result.metrics), ATTRIBUTION_CAPTION).show()
+        rows.show()
     if result.left_out:
         print_line(f"left out of all cases, not to be modelled in one: {', '.join(result.left_out)}")
     print_line(f"attribution: {out.resolve()}")

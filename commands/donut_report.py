@@ -93,10 +93,7 @@ def show_fit(fit: DonutFit, converted: ObservatoryZernikes, motions: BodyMotions
     """Print the table of a fit, that of hexapod corrections, and remarks."""
     import numpy as np
 
-    print_line(fit_verdict(fit))
-    scale, unit, form = {"pachon": (1e9, "nm", ".0f"), "ts_wep": (1.0, "um", ".3f")}.get(
-        converted.convention, (1.0, "waves", ".3f")
-    )
+    scale, unit, form = _unit(converted)
     rows = []
     for i, (x, y) in enumerate(np.rad2deg(converted.fields)):
         if not fit.usable[i]:
@@ -118,26 +115,37 @@ def show_fit(fit: DonutFit, converted: ObservatoryZernikes, motions: BodyMotions
         "chi2 a pixel",
     )
     caption = f"{_CAPTION} Frame {converted.frame}, convention {converted.convention}."
-    Rows(headings, rows, caption, left=2).show()
+    Rows(headings, rows, caption, left=2, verdict=fit_verdict(fit, converted)).show()
     if motions is not None:
         Rows(*motion_rows(motions), left=1).show()
     for line in _remarks(fit):
         print_line(line)
 
 
-def fit_verdict(fit: DonutFit) -> str:
-    """Return the result of a fit in one sentence."""
+def fit_verdict(fit: DonutFit, converted: ObservatoryZernikes) -> str:
+    """Return the result of a fit in one sentence, in the frame and the convention of its table."""
     import numpy as np
 
     usable = np.flatnonzero(fit.usable)
     if not usable.size:
-        return f"None of {len(fit)} donuts can be used: the reasons stand beside them."
-    terms = np.atleast_2d(fit.zernikes[usable])
-    rms = 1e9 * np.median(np.linalg.norm(terms, axis=1))
-    largest = int(np.argmax(np.abs(np.median(terms, axis=0))))
-    size = 1e9 * np.median(terms, axis=0)[largest]
-    count = f"{usable.size} of {len(fit)} donuts" if len(fit) > 1 else "The donut"
-    return f"{count}: the wavefront is off by {rms:.0f} nm rms (median), most in Z{fit.noll[largest]} ({size:+.0f} nm)."
+        return "The donut cannot be used." if len(fit) == 1 else f"None of {len(fit)} donuts can be used."
+    scale, unit, form = _unit(converted)
+    terms = scale * converted.values[usable]
+    typical = np.median(terms, axis=0)
+    largest = int(np.argmax(np.abs(typical)))
+    rms = f"{np.median(np.linalg.norm(terms, axis=1)):{form}} {unit} rms"
+    size = f"Z{fit.noll[largest]} ({typical[largest]:+{form}} {unit})"
+    if len(fit) == 1:
+        return f"The wavefront is off by {rms}, most in {size}."
+    return (
+        f"{usable.size} of {len(fit)} donuts can be used: by the median the wavefront is off by {rms}, most in {size}."
+    )
+
+
+def _unit(converted: ObservatoryZernikes) -> tuple[float, str, str]:
+    """Return the factor to the unit of a table, the unit, and the format of its numbers."""
+    units = {"pachon": (1e9, "nm", ".0f"), "ts_wep": (1.0, "um", ".3f")}
+    return units.get(converted.convention, (1.0, "waves", ".3f"))
 
 
 def _remarks(fit: DonutFit) -> list[str]:

@@ -228,7 +228,8 @@ def donuts_command(
     ] = False,
     perturb: Annotated[
         list[str] | None,
-        Option(
+        names(
+            completion.motions,
             metavar="BODY.MOTION=SIZE",
             help="Of --simulate, what is wrong with the telescope: M2.dx=200um.",
             rich_help_panel=_SIMULATION,

@@ -11,8 +11,9 @@ from typer import Option
 from ..core.terminal import print_line
 from .choices import choice
 from .night import Bands, ListFile, Night, VisitNumber, Where, listed_visit, require_list
-from .options import AllCcds, Ccds, Config, Json, Quiet, Raft, Threads, chosen_ccds, set_option
-from .tables import Rows, print_json
+from .options import AllCcds, Ccds, Config, Json, Quiet, Raft, TableFile, Threads, chosen_ccds, set_option
+from .tables import Rows, print_json, write_rows
+from .verdicts import images_verdict
 from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 app = typer.Typer()
@@ -52,6 +53,7 @@ def images_command(
     processes: Processes = None,
     scheduler: Scheduler = None,
     workers: DaskWorkers = None,
+    table: TableFile = None,
     settings: ImagesSettings = None,
     threads: Threads = None,
     quiet: Quiet = False,
@@ -114,9 +116,15 @@ def images_command(
     ) as execution:
         result = simulate_images(images_config, out, experiment=experiment, execution=execution)
     images = {name: str(path.resolve()) for name, path in result.images.items()}
+    rows = Rows(
+        ("CCD", "objects"),
+        [(name, str(result.objects.get(name, "kept"))) for name in images],
+        "Stars and galaxies whose centres lie on the image.",
+        verdict=images_verdict(result.objects, len(images)),
+    )
+    write_rows(rows, table)
     if as_json:
         print_json({"images": images, "objects": result.objects, "kept": list(result.kept)})
     elif not quiet:
-        rows = [(name, str(result.objects.get(name, "kept"))) for name in images]
-        Rows(("CCD", "objects"), rows, "Stars and galaxies whose centres lie on the image.").show()
+        rows.show()
         print_line(f"images: {out.resolve()}")

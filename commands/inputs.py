@@ -13,31 +13,38 @@ from ..core.terminal import print_warning
 
 if TYPE_CHECKING:
     from ..models.telescope import Telescope
+    from ..pipeline.config import Configuration as RunConfiguration
     from ..pipeline.experiment import Experiment
 
 
-def configured_experiment(
+def configuration(
     config: Path | None, set_texts: Sequence[str] | None = None, *, paper_model: bool = False, **options: object
-) -> Experiment:
-    """Return the experiment of a configuration file, of values of `--set`, and of options by key, None where not given.
+) -> RunConfiguration:
+    """Return the configuration of a file, of values of `--set`, and of options by key, None where not given.
 
     With `paper_model` the PSF model is that of Jee & Tyson 2011 where the file names none.
     """
     from ..core.set_keys import with_set_keys
     from ..pipeline.config import Configuration, load_configuration, with_options
     from ..pipeline.defaults import with_paper_model
-    from ..pipeline.experiment import Experiment
 
     file = Configuration() if config is None else load_configuration(config)
     base = with_set_keys(file, set_texts or ())
-    if paper_model:
-        base = with_paper_model(base)
-    settings = with_options(base, **options)
+    return with_options(with_paper_model(base) if paper_model else base, **options)
+
+
+def configured_experiment(
+    config: Path | None, set_texts: Sequence[str] | None = None, *, paper_model: bool = False, **options: object
+) -> Experiment:
+    """Return the experiment of a :func:`configuration`."""
+    from ..pipeline.experiment import Experiment
+
+    settings = configuration(config, set_texts, paper_model=paper_model, **options)
     try:
         with warnings_shown(HeightWarning):
             return Experiment.from_config(settings, None if config is None else config.parent)
     except PachonError as error:
-        if config is None or settings is not base or set_texts:
+        if config is None or set_texts or any(value is not None for value in options.values()):
             raise  # an option may be at fault, not the file
         raise error.within(file=config) from None
 

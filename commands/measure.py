@@ -21,15 +21,18 @@ from .options import (
     Order,
     Quiet,
     Recipe,
+    TableFile,
     Threads,
     Weights,
     recipe_of_options,
 )
-from .tables import Rows, print_json
+from .tables import Rows, print_json, write_rows
+from .verdicts import measure_verdict
 from .workers import Processes, long_work
 
 if TYPE_CHECKING:
     from ..imaging.image_formats.load import WeightName
+    from ..imaging.measure_files import MeasuredFiles
 
 app = typer.Typer()
 
@@ -100,6 +103,7 @@ def measure_command(
     ] = False,
     resume: Annotated[bool, Option("--resume", help="Keep whole products of images measured in the same way.")] = False,
     processes: Processes = None,
+    table: TableFile = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -178,27 +182,39 @@ def measure_command(
             pictures,
         )
         measured = measure_files(images, out, extension=extension, options=options, execution=execution)
+    rows = _image_rows(measured)
+    write_rows(rows, table)
     if as_json:
         print_json({"images": measured.metrics, "left_out": measured.left_out})
     elif not quiet:
-        rows = []
-        for name, m in measured.metrics.items():
-            density = m["usable_per_arcmin2"]
-            row = [
-                name,
-                str(m["objects"]),
-                str(m["stars"]),
-                str(m["usable"]),
-                "" if density is None else f"{density:.1f}",
+        rows.show()
+
+
+def _image_rows(measured: MeasuredFiles) -> Rows:
+    """Return what was measured on each image; with the truth, how much of it."""
+    rows = []
+    for name, m in measured.metrics.items():
+        density = m["usable_per_arcmin2"]
+        row = [
+            name,
+            str(m["objects"]),
+            str(m["stars"]),
+            str(m["usable"]),
+            "" if density is None else f"{density:.1f}",
+        ]
+        if "purity" in m:
+            row += [
+                f"{m['star_completeness']:.2f}, {m['star_purity']:.2f}",
+                str(m["magnitude_half_complete"]),
+                f"{m['purity']:.3f}",
             ]
-            if "purity" in m:
-                row += [
-                    f"{m['star_completeness']:.2f}, {m['star_purity']:.2f}",
-                    str(m["magnitude_half_complete"]),
-                    f"{m['purity']:.3f}",
-                ]
-            rows.append(row)
-        has_truth = any("purity" in m for m in measured.metrics.values())
-        columns = len(_HEADINGS) if has_truth else _COLUMNS
-        padded_rows = [(row + [""] * columns)[:columns] for row in rows]
-        Rows(_HEADINGS[:columns], padded_rows, _CAPTION if has_truth else "").show()
+        rows.append(row)
+    has_truth = any("purity" in m for m in measured.metrics.values())
+    columns = len(_HEADINGS) if has_truth else _COLUMNS
+    padded_rows = [(row + [""] * columns)[:columns] for row in rows]
+    return Rows(
+        _HEADINGS[:columns],
+        padded_rows,
+        _CAPTION if has_truth else "",
+        verdict=measure_verdict(measured.metrics, len(measured.left_out)),
+    )

@@ -28,11 +28,11 @@ from .options import (
     StarX,
     StarY,
     Weights,
-    check_table,
     picture_kind,
     recipe_of_options,
 )
 from .tables import Rows, print_json
+from .verdicts import model_verdict
 
 if TYPE_CHECKING:
     from ..reconstruction.psf_model.colour import FittedColour
@@ -97,7 +97,6 @@ def model_command(
     from ..reconstruction.own_stars.star_catalogue import load_stars
 
     kind = picture_kind(picture)
-    check_table(table)
     chosen_recipe = recipe_of_options(recipe, basis, interpolation, components, weights, order)
     options: dict[str, Any] = {} if chosen_recipe is None else {"recipe": chosen_recipe}
     path = stars.with_name(f"{stars.stem}_psf.fits") if out is None else out
@@ -144,7 +143,7 @@ def model_command(
         ]
         if colour_column is not None:
             rows.insert(1, ("dependence on colour", _colour_text(colour_column, result.model.colour)))
-        Rows(("", ""), rows, left=2).show()
+        Rows(("", ""), rows, left=2, verdict=model_verdict(summary_of_stars)).show()
 
 
 def _colour_text(column: str, colour: FittedColour | None) -> str:

@@ -12,14 +12,14 @@ from ..core.errors import ConfigError
 from ..core.terminal import print_line
 from . import completion
 from .choices import names
-from .tables import Rows, print_json
+from .tables import Rows, print_json, write_rows
 
 if TYPE_CHECKING:
-    from ..core.long_work import Execution
     from ..pipeline.config import Configuration
     from ..pipeline.experiment import Experiment
     from ..sky.visit_list.visit_list import ListedVisit
     from ..studies.night.config import NightConfig
+    from ..studies.night.night import NightResult
 
 ListFile = Annotated[
     Path | None,
@@ -107,30 +107,31 @@ def listed_experiment(config: Configuration, visit: ListedVisit, folder: Path | 
         return visit_experiment(config, visit, folder)
 
 
-def show_night(
-    settings: NightConfig,
-    out: Path,
-    base: Path | None,
-    part: tuple[int, int],
-    execution: Execution,
-    *,
-    quiet: bool,
-    as_json: bool,
-) -> None:
-    """Compute the visits of a list, and show what came out."""
-    from ..studies.night.night import run_night
-    from ..studies.night.report import REPORT_NAME, verdict
-
-    result = run_night(settings, out, base=base, part=part, execution=execution)
+def show_night(result: NightResult, out: Path, table: Path | None, *, quiet: bool, as_json: bool) -> None:
+    """Show what the visits of a list have given."""
     if quiet:  # the reporter has printed nothing
         for visit, reason in result.left_out.items():
             print_line(f"pachon: visit {visit} is left out: {reason}", error=True)
+    rows = _band_rows(result)
+    write_rows(rows, table)
     if as_json:
         print_json(result.summary)
         return
     if quiet:
         return
-    print_line(verdict(result.summary))
+    rows.show()
+    if result.missing:
+        print_line(f"{len(result.missing)} visits are missing; the last part to end has them all")
+    if result.left_out:
+        print_line(f"{len(result.left_out)} visits are left out, summary.json has the reasons")
+    print_line(f"night: {out.resolve()}")
+    print_line(f"report: {(out / 'report.html').resolve()}")
+
+
+def _band_rows(result: NightResult) -> Rows:
+    """Return medians over the visits and CCDs of each band."""
+    from ..studies.night.report import verdict
+
     columns = {
         "psfSigma [pixel]": ("median_psfSigma", ".3f"),
         "psfArea [pixel²]": ("median_psfArea", ".1f"),
@@ -147,10 +148,4 @@ def show_night(
         )
         for band, metrics in result.summary["bands"].items()
     ]
-    Rows(("band", "visits x CCDs", *columns), rows, _CAPTION).show()
-    if result.missing:
-        print_line(f"{len(result.missing)} visits are missing; the last part to end has them all")
-    if result.left_out:
-        print_line(f"{len(result.left_out)} visits are left out, summary.json has the reasons")
-    print_line(f"night: {out.resolve()}")
-    print_line(f"report: {(out / REPORT_NAME).resolve()}")
+    return Rows(("band", "visits x CCDs", *columns), rows, _CAPTION, verdict=verdict(result.summary))

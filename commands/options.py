@@ -102,7 +102,11 @@ AcrossBand = Annotated[
 Projection = Annotated[str, choice(PROJECTIONS, help="Meaning of the field angles.")]
 Picture = Annotated[
     Path | None,
-    Option("--picture", help="Picture to write, .png, .pdf or .svg; by default named after command and model."),
+    Option(
+        "--picture",
+        metavar="FILE",
+        help="Picture to write, .png, .pdf or .svg; by default named after command and model.",
+    ),
 ]
 NoPicture = Annotated[bool, Option("--no-picture", help="Draw no picture.")]
 TableFile = Annotated[
@@ -230,10 +234,8 @@ def picture_kind(picture: Path | None) -> str:
     return kind
 
 
-def check_table(table: Path | None) -> None:
-    """Check the ending of a table's name, before anything is computed."""
-    if table is None:
-        return
+def check_table(table: Path) -> None:
+    """Check the ending of a table's name."""
     from ..core.table_files import FORMATS
 
     if table.suffix.lower() not in FORMATS:

@@ -42,6 +42,8 @@ class PlainCommand(PlainHelp, TyperCommand):
         """Parse arguments, with options of earlier versions; one that is gone says what has replaced it."""
         aliases = ALIASES.get(str(self.name), {})
         renamed = [aliases.get(option, option) + equals + value for option, equals, value in map(_parts, args)]
+        if any(param.param_type_name == "argument" and param.name == "out" for param in self.params):
+            renamed = _with_out_last(renamed)
         try:
             return super().parse_args(ctx, renamed)
         except Exception as error:
@@ -61,6 +63,16 @@ class PlainCommand(PlainHelp, TyperCommand):
 
 def _parts(argument: str) -> tuple[str, str, str]:
     return argument.partition("=") if argument.startswith("--") else (argument, "", "")
+
+
+def _with_out_last(args: list[str]) -> list[str]:
+    """Return arguments with the value of --out, where it is given, behind the others: as the argument OUT."""
+    for place, (option, equals, value) in enumerate(map(_parts, args)):
+        if option == "--out" and equals:
+            return [*args[:place], *args[place + 1 :], value]
+        if option in ("-o", "--out"):
+            return [*args[:place], *args[place + 2 :], *args[place + 1 : place + 2]]
+    return args
 
 
 def _name_value(param: Any, ctx: Any) -> None:

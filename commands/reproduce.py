@@ -12,8 +12,9 @@ from typer import Argument, Option
 from ..core.terminal import print_line
 from . import completion
 from .choices import choice, names
-from .options import Json, Quiet, Threads
-from .tables import print_json, wide_console
+from .options import Json, Quiet, TableFile, Threads
+from .tables import Rows, print_json, wide_console, write_rows
+from .verdicts import reproduced_verdict
 from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ def reproduce_command(
     processes: Processes = None,
     scheduler: Scheduler = None,
     workers: DaskWorkers = None,
+    table: TableFile = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -74,6 +76,9 @@ def reproduce_command(
         summary = reproduce_at(
             figures or ("all",), scale, out, seed=seed, engine=cast("EngineName", engine), execution=execution
         )
+    headings = ("figure", "paper", "here", "verdict", "why")
+    cells = [(name, *(figure[key] for key in headings[1:])) for name, figure in summary["figures"].items()]
+    write_rows(Rows(headings, cells), table)
     if as_json:
         print_json(summary)
     elif not quiet:
@@ -81,6 +86,7 @@ def reproduce_command(
 
 
 def _show_reproduced(summary: dict[str, Any], folder: Path) -> None:
+    print_line(reproduced_verdict(summary["figures"]))
     table = Table(header_style="bold", padding=(0, 1), show_lines=True)
     table.add_column("figure", no_wrap=True)
     for name in ("paper", "here", "verdict"):

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Option
 
-from ..core.terminal import print_line
-from .inputs import configured_experiment
+from ..core.terminal import print_line, print_warning
+from .inputs import configuration, configured_experiment
 from .night import (
     Bands,
     ListFile,
@@ -21,14 +21,29 @@ from .night import (
     part_of,
     require_list,
 )
-from .options import AllCcds, Ccds, Config, Json, ObservedStars, Quiet, Raft, Settings, Threads, TruthStars, chosen_ccds
-from .tables import Rows, plain_table, print_json, wide_console
+from .options import (
+    AllCcds,
+    Ccds,
+    Config,
+    Json,
+    ObservedStars,
+    Quiet,
+    Raft,
+    Settings,
+    TableFile,
+    Threads,
+    TruthStars,
+    chosen_ccds,
+)
+from .tables import Rows, plain_table, print_json, wide_console, write_rows
 from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 if TYPE_CHECKING:
     from ..pipeline.run import RunResult
 
 app = typer.Typer()
+#: Most CCDs whose metrics are printed.
+_SHOWN = 21
 
 
 @app.command("run")
@@ -54,6 +69,7 @@ def run_command(
     night: Night = None,
     truth_stars: TruthStars = None,
     observed_stars: ObservedStars = None,
+    table: TableFile = None,
     settings: Settings = None,
     threads: Threads = None,
     quiet: Quiet = False,
@@ -78,25 +94,20 @@ def run_command(
     - `pachon run --all --out full --part 3/8`: one of eight jobs of a batch system, with one folder for all
     - `pachon run --list baseline.db --visit 1004 --out visit1004`: a visit of a scheduler's list
     """
-    from ..core.set_keys import with_set_keys
-    from ..pipeline.config import Configuration, load_configuration, with_options
     from ..pipeline.run import run
     from ..pipeline.simulate.ccd_loop import left_out_line
 
-    names = chosen_ccds(ccds, raft, all_ccds)
+    options = {
+        "ccds": chosen_ccds(ccds, raft, all_ccds),
+        "seed": seed,
+        "stars__truth": truth_stars,
+        "stars__observed": observed_stars,
+    }
     if visit_list is None:
         require_list(("--visit", visit), ("--where", where), ("--band", band), ("--night", night))
-        experiment = configured_experiment(
-            config, settings, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars
-        )
+        experiment = configured_experiment(config, settings, **options)
     else:
-        base = with_options(
-            with_set_keys(Configuration() if config is None else load_configuration(config), settings or ()),
-            ccds=names,
-            seed=seed,
-            stars__truth=truth_stars,
-            stars__observed=observed_stars,
-        )
+        base = configuration(config, settings, **options)
         listed = listed_visit(base, visit_list, visit, where, band, night)
         experiment = listed_experiment(base, listed, None if config is None else config.parent)
     hint = f"finished CCDs are in {out}, and --resume goes on from there"
@@ -109,6 +120,10 @@ def run_command(
             print_line(f"pachon: {left_out_line(name, reason)}", error=True)
         for warning in result.summary.get("warnings", ()):
             print_line(f"pachon: {warning}", error=True)
+    if result.report:
+        write_rows(_ccd_rows(result), table)
+    elif table is not None:
+        print_warning(f"{table} is not written: {len(result.missing)} CCDs of other parts are missing")
     if as_json:
         part_summary = {"missing": list(result.missing), "not_modelled": result.not_modelled}
         print_json(result.summary if result.report else part_summary)
@@ -128,28 +143,25 @@ def _show_part(result: RunResult) -> None:
     print_line("the last part to end writes the report")
 
 
+def _ccd_rows(result: RunResult) -> Rows:
+    """Return the metrics of each CCD."""
+    from ..pipeline.report.tables import PER_CCD_CAPTION, PER_CCD_COLUMNS, per_ccd
+
+    headings = [f"{name} [{unit}]" if unit else name for name, unit in PER_CCD_COLUMNS]
+    return Rows(headings, per_ccd(result.summary), PER_CCD_CAPTION, left=sum(not unit for _, unit in PER_CCD_COLUMNS))
+
+
 def _show_run(result: RunResult, report: Path, seconds: float) -> None:
-    from ..pipeline.report.tables import (
-        MODELS_CAPTION,
-        MODELS_COLUMNS,
-        MOMENTS_NOTE,
-        PER_CCD_CAPTION,
-        PER_CCD_COLUMNS,
-        headline,
-        models_rows,
-        per_ccd,
-        verdict,
-    )
+    from ..pipeline.report.tables import MODELS_CAPTION, MODELS_COLUMNS, MOMENTS_NOTE, headline, models_rows, verdict
 
     console = wide_console()
     console.print(f"{verdict(result.summary)}\n", highlight=False)
     headlines = plain_table(show_header=False)
     for name, value in headline(result.summary):
         headlines.add_row(name, value)
-    rows = per_ccd(result.summary)
-    if len(rows) <= 21:
-        headings = [f"{name} [{unit}]" if unit else name for name, unit in PER_CCD_COLUMNS]
-        Rows(headings, rows, PER_CCD_CAPTION, left=sum(not unit for _, unit in PER_CCD_COLUMNS)).show()
+    rows = _ccd_rows(result)
+    if len(rows.rows) <= _SHOWN:
+        rows.show()
         console.print()
     console.print(headlines)
     console.print(MOMENTS_NOTE)

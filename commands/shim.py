@@ -13,11 +13,12 @@ from . import completion
 from .choices import choice, names
 from .inputs import configured_experiment
 from .interrupt import interruptible
-from .options import Ccds, Config, Json, Quiet, Raft, Settings, Threads, one_name_list
-from .tables import Rows, print_json
+from .options import Ccds, Config, Json, Quiet, Raft, Settings, TableFile, Threads, one_name_list
+from .tables import Rows, print_json, write_rows
+from .verdicts import shim_verdict
 
 if TYPE_CHECKING:
-    from ..studies.shimming.shim import ShimmedParts, ShimMerit
+    from ..studies.shimming.shim import ShimmedParts, ShimMerit, Shims
 
 app = typer.Typer()
 _CAPTION = (
@@ -51,6 +52,7 @@ def shim_command(
     ] = "fwhm",
     parts: Annotated[str, choice(("rafts", "ccds"), help="What moves.")] = "rafts",
     out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_shims"),
+    table: TableFile = None,
     settings: Settings = None,
     threads: Threads = None,
     quiet: Quiet = False,
@@ -70,7 +72,7 @@ def shim_command(
     """
     from ..core.files import make_folder
     from ..studies.shimming.product import shim_metrics, write_shims
-    from ..studies.shimming.shim import STATES, shim
+    from ..studies.shimming.shim import shim
 
     ccd_names = one_name_list(ccds=ccds, raft=raft) or ("all",)
     experiment = configured_experiment(
@@ -86,34 +88,42 @@ def shim_command(
             reporter=reporter,
         )
     write_shims(shims, out, experiment)
+    rows = _state_rows(shims)
+    write_rows(rows, table)
     if as_json:
         print_json(shim_metrics(shims))
         return
     if not quiet:
-        reference = shims.checked["focused"].fwhm
-        rows = [
-            (
-                state,
-                f"{m.fwhm:.4f}",
-                f"{1e3 * (m.fwhm - reference):+.2f}",
-                f"{m.size:.4f}",
-                f"{1e3 * m.rms_g:.2f}",
-                f"{1e6 * m.rms_xi_g:.2f}",
-                f"{1e3 * m.rms_e:.2f}",
-            )
-            for state, m in ((state, shims.checked[state]) for state in STATES)
-        ]
-        Rows(
-            (
-                "focal plane",
-                "mean FWHM [arcsec]",
-                "less focused [mas]",
-                "mean T [arcsec²]",
-                "rms g [1e-3]",
-                "rms xi+ of g [1e-6]",
-                "rms e [1e-3]",
-            ),
-            rows,
-            _CAPTION,
-        ).show()
+        rows.show()
     print_line(f"shims: {out.resolve()}")
+
+
+def _state_rows(shims: Shims) -> Rows:
+    """Return the means over the focal plane: as it is, focused, shimmed, and without heights."""
+    from ..studies.shimming.shim import STATES
+
+    checked = shims.checked
+    reference = checked["focused"].fwhm
+    rows = [
+        (
+            state,
+            f"{m.fwhm:.4f}",
+            f"{1e3 * (m.fwhm - reference):+.2f}",
+            f"{m.size:.4f}",
+            f"{1e3 * m.rms_g:.2f}",
+            f"{1e6 * m.rms_xi_g:.2f}",
+            f"{1e3 * m.rms_e:.2f}",
+        )
+        for state, m in ((state, checked[state]) for state in STATES)
+    ]
+    headings = (
+        "focal plane",
+        "mean FWHM [arcsec]",
+        "less focused [mas]",
+        "mean T [arcsec²]",
+        "rms g [1e-3]",
+        "rms xi+ of g [1e-6]",
+        "rms e [1e-3]",
+    )
+    sentence = shim_verdict(shims.merit, shims.parts, checked["focused"], checked["shimmed"])
+    return Rows(headings, rows, _CAPTION, verdict=sentence)

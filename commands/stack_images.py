@@ -8,10 +8,11 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from ..core.errors import PachonError
+from ..core.errors import ConfigError, PachonError
 from ..core.terminal import print_line
-from .options import Json, Quiet, Threads
-from .tables import Rows, print_json
+from .options import Json, Quiet, TableFile, Threads
+from .tables import Rows, print_json, write_rows
+from .verdicts import stack_verdict
 from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 app = typer.Typer()
@@ -36,6 +37,7 @@ def stack_images_command(
     processes: Processes = None,
     scheduler: Scheduler = None,
     workers: DaskWorkers = None,
+    table: TableFile = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -62,6 +64,8 @@ def stack_images_command(
 
     overrides = {"tiles": tiles, "faintest": faintest, "side": side, "noise": noise}
     settings = ImageStackConfig(**{key: value for key, value in overrides.items() if value is not None})
+    if table is not None and not measure:
+        raise ConfigError("--table with --no-measure: expected one of them, without galaxies there is no table")
     hint = f"finished visits are in {folder}, and --resume goes on from there"
     with long_work(
         quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
@@ -74,15 +78,17 @@ def stack_images_command(
                 f"the stacked images are kept in {stack.folder}, not all of them measured (--no-measure)"
             ) from None
     metrics = {str(visits): figures for visits, figures in metrics_by_visits.items()}
+    rows = _stack_rows(metrics)
+    write_rows(rows, table)
     if as_json:
         print_json({"folder": str(stack.folder.resolve()), "stacks": metrics})
     elif not quiet:
         if metrics:
-            _show(metrics)
+            rows.show()
         print_line(f"images: {stack.folder.resolve()}")
 
 
-def _show(metrics: dict[str, dict[str, Any]]) -> None:
+def _stack_rows(metrics: dict[str, dict[str, Any]]) -> Rows:
     rows = []
     for visits, stack_metrics in metrics.items():
         densities = [
@@ -97,4 +103,4 @@ def _show(metrics: dict[str, dict[str, Any]]) -> None:
             shifts, response = ["", ""], ""
         rows.append((visits, *densities, *shifts, response))
     headings = ("visits", "detected", "usable", "on stamps", "e1 difference", "e2 difference", "response")
-    Rows(headings, rows, _CAPTION).show()
+    return Rows(headings, rows, _CAPTION, verdict=stack_verdict(metrics) if metrics else "")

@@ -23,6 +23,8 @@ def current_names() -> dict[str, Any]:
     from ..core.key_descriptions import describe_keys
     from ..design.optimize.operand_names import NAMES
     from ..studies.attribution.causes import CAUSES
+    from ..studies.metrics.camera import CAMERA
+    from ..studies.metrics.optics import OPTICS
     from ..studies.reproduce.reproduce import FIGURES
     from .config_kinds import KINDS, model_of
 
@@ -31,6 +33,7 @@ def current_names() -> dict[str, Any]:
         "operands": list(NAMES),
         "causes": list(CAUSES),
         "figures": list(FIGURES),
+        "metrics": [*OPTICS, *CAMERA],
         "keys": {
             kind: {key.key: list(key.choices or words.get(key.type, ())) for key in describe_keys(model_of(kind))}
             for kind in KINDS

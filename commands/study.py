@@ -14,8 +14,8 @@ from . import completion
 from .choices import names
 from .inputs import configured_experiment
 from .interrupt import interruptible
-from .options import Config, Json, Quiet, Settings, Threads, TruthStars, name_list, one_name_list
-from .tables import Rows, print_json, wide_console
+from .options import Config, Json, Quiet, Settings, TableFile, Threads, TruthStars, name_list, one_name_list
+from .tables import Rows, print_json, wide_console, write_rows
 
 if TYPE_CHECKING:
     from ..studies.psf_choice.study import Study
@@ -62,6 +62,7 @@ def study_command(
     draws: Annotated[int, Option(min=1, help="Draws of the noise.")] = 4,
     out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_study"),
     truth_stars: TruthStars = None,
+    table: TableFile = None,
     settings: Settings = None,
     threads: Threads = None,
     quiet: Quiet = False,
@@ -107,18 +108,22 @@ def study_command(
     with interruptible(quiet) as reporter:
         result = study(resolved, plan, threads=threads, reporter=reporter)
     write_study(result, out, resolved)
+    rows = _case_rows(result)
+    write_rows(rows, table)
     if as_json:
         print_json(study_summary(result))
         return
     if not quiet:
-        _show(result)
+        rows.show()
+        _show_problems(result)
     print_line(f"study: {out.resolve()}")
 
 
-def _show(result: Study) -> None:
+def _case_rows(result: Study) -> Rows:
+    """Return the residuals of the base, the default, the recommended model and the best orders."""
     from ..studies.psf_choice.plan import FOCAL_PLANE
 
-    plan, best_case, console = result.plan, result.recommended(), wide_console()
+    plan, best_case = result.plan, result.recommended()
     cases = [plan.base, plan.default, *([best_case] if best_case is not None else [])]
     ways = ("equal", "softened", *(FOCAL_PLANE if plan.focal_plane else ()))
     for stars in plan.stars:
@@ -127,21 +132,27 @@ def _show(result: Study) -> None:
     for case in dict.fromkeys(cases):
         if (case_metrics := result.metrics.get(case)) is not None:
             rows.append((f"{case.stars} stars, {case}", *(f"{case_metrics[key]:.1e}" for key in _COLUMNS)))
-    Rows(("model", *_COLUMNS.values()), rows, _CAPTION).show()
+    return Rows(("model", *_COLUMNS.values()), rows, _CAPTION, verdict=_verdict(result))
+
+
+def _verdict(result: Study) -> str:
+    """Return the recommended model in one sentence."""
+    base, best_case = result.plan.base, result.recommended()
+    if best_case is None:
+        return f"No model of {base.stars} stars could be fitted."
+    metrics = result.metrics[best_case]
+    return (
+        f"Recommended for {base.stars} stars of S/N {base.snr:g} and more: {best_case}; residual of g at holdout "
+        f"positions {metrics['rms_g_away']:.2e} ± {metrics['error_rms_g_away']:.0e}."
+    )
+
+
+def _show_problems(result: Study) -> None:
     if result.problems:
         case, why = next(iter(result.problems.items()))
-        console.print(
+        wide_console().print(
             f"{len(result.problems)} models could not be fitted, such as {case.stars} stars, {case}: {why}", style="dim"
         )
-    if best_case is None:
-        console.print(f"no model of {plan.base.stars} stars could be fitted")
-        return
-    error = result.metrics[best_case]["error_rms_g_away"]
-    console.print(
-        f"recommended for {plan.base.stars} stars of S/N {plan.base.snr:g} and more: {best_case}; residual of g at "
-        f"holdout positions {result.metrics[best_case]['rms_g_away']:.2e} ± {error:.0e}",
-        highlight=False,
-    )
 
 
 def _numbers(text: str, option: str, kind: type[_Number]) -> tuple[_Number, ...]:

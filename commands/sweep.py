@@ -16,13 +16,15 @@ from . import completion
 from .choices import names
 from .default_group import DefaultGroup
 from .options import Json, Quiet, Threads, set_option
-from .tables import Rows, print_json
+from .tables import plain_table, print_json, wide_console
 from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 if TYPE_CHECKING:
     from ..core.long_work import Execution
 
 app = typer.Typer()
+#: Most points that could not be computed of which `status` prints the reasons.
+_SHOWN = 20
 sweep_app = typer.Typer(cls=DefaultGroup, subcommand_metavar="| COMMAND [ARGS]...")
 app.add_typer(sweep_app, name="sweep")
 
@@ -158,7 +160,10 @@ def sweep_status(store: Store, as_json: Json = False) -> None:
     }
     _show(status, as_json)
     if problems and not as_json:
-        Rows(["point", "problem"], [[str(r.number), r.problem or ""] for r in problems[:20]], left=2).show()
+        for result in problems[:_SHOWN]:
+            print_line(f"point {result.number}: {result.problem}")
+        if len(problems) > _SHOWN:
+            print_line(f"{len(problems) - _SHOWN} more have failed: sweep export has all")
 
 
 @sweep_app.command("export")
@@ -217,4 +222,7 @@ def _show(values: dict[str, Any], as_json: bool, quiet: bool = False) -> None:
     if as_json:
         print_json(values)
     elif not quiet:
-        Rows(["", ""], [[k.replace("_", " "), "" if v is None else f"{v}"] for k, v in values.items()], left=2).show()
+        lines = plain_table(show_header=False)
+        for name, value in values.items():
+            lines.add_row(name.replace("_", " "), "" if value is None else f"{value}")
+        wide_console().print(lines, highlight=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ..core.terminal import terminal_json, terminal_text
+from ..core.terminal import print_line, terminal_json, terminal_text
 
 
 class Column(NamedTuple):
@@ -23,6 +24,7 @@ class Column(NamedTuple):
     values: str | Callable[[Any], Any]  #: key of the result's summary, or function from the result to a value per row
     form: str = ""  #: format of the numbers; of pairs that of each
     scale: float = 1.0  #: factor from the value to the unit of the heading
+    subject: str = ""  #: what its numbers are, in a verdict; empty of columns that give none
 
     def title(self, summary: dict[str, Any]) -> str:
         """Return the heading."""
@@ -33,9 +35,21 @@ class Column(NamedTuple):
 
     def texts(self, result: Any, summary: dict[str, Any]) -> list[str]:
         """Return the cells of the column."""
+        return number_texts(self.numbers(result, summary), self.form)
+
+    def numbers(self, result: Any, summary: dict[str, Any]) -> Any:
+        """Return the values of the column in the unit of the heading."""
         key = self.key(summary)
         values = key(result) if callable(key) else summary[key]
-        return number_texts(values if self.scale == 1.0 else self.scale * values, self.form)
+        return values if self.scale == 1.0 else self.scale * values
+
+    def verdict(self, result: Any, summary: dict[str, Any]) -> str:
+        """Return the range of the numbers in one sentence."""
+        unit = re.search(r"\[([^][]+)\]", self.title(summary))
+        numbers = self.numbers(result, summary)
+        values = range_text(numbers, self.form, unit[1] if unit else "")
+        over = f" over {len(numbers)} fields" if len(numbers) > 1 else ""
+        return f"{self.subject} is {values}{over}."
 
     def key(self, summary: dict[str, Any]) -> Any:
         """Return the values: their function or key, that of angles where the image is at infinity; None if absent."""
@@ -60,6 +74,22 @@ def field_headings(result: Any) -> list[str]:
     return [f"{text}°" if name == "field_deg" else f"{text} mm" for text in number_texts(values, ".4g")]
 
 
+def range_text(values: Any, form: str, unit: str = "") -> str:
+    """Return the range of the finite numbers among some; a word where there are none."""
+    import numpy as np
+
+    numbers = np.asarray(values, dtype=np.float64)
+    finite = numbers[np.isfinite(numbers)]
+    if not finite.size:
+        return "unknown"
+    low, high = number_texts((finite.min(), finite.max()), form)
+    return f"{low if low == high else f'{low} to {high}'}{f' {unit}' if unit else ''}"
+
+
+#: Signs in headings, and their spelling in ASCII.
+_ASCII = {"µ": "u", "ξ": "xi", "²": "2", "³": "3", "°": " deg", "±": "+-", "Δ": "d", "λ": "lambda", "θ": "theta"}
+
+
 @dataclass(frozen=True)
 class Rows:
     """A table as text."""
@@ -68,9 +98,12 @@ class Rows:
     rows: Sequence[Sequence[str]]
     caption: str = ""  #: meaning of the columns, printed below
     left: int = 1  #: number of columns that are aligned on the left, as names are; the others hold numbers
+    verdict: str = ""  #: result in one sentence, printed above
 
     def show(self) -> None:
-        """Print the table."""
+        """Print the verdict, and the table."""
+        if self.verdict:
+            print_line(self.verdict)
         # Columns are never cut: a narrower terminal wraps the lines itself.
         columns = zip(self.headings, *self.rows, strict=True)
         console = wide_console(sum(max(cell_len(terminal_text(text)) for text in column) + 2 for column in columns))
@@ -84,23 +117,75 @@ class Rows:
             console.print(self.caption, style="dim", width=100)
 
     def write(self, path: Path) -> None:
-        """Write the table: .ecsv, .csv, .fits or .parquet; columns of numbers as numbers."""
+        """Write the table: .ecsv, .csv, .fits or .parquet; numbers as numbers, with units and errors of their own."""
         from astropy.table import Table as AstropyTable
 
-        from ..core.table_files import write_table
+        from ..core.table_files import flat_table, write_table
 
         table = AstropyTable()
-        for name, *cells in zip(self.headings, *self.rows, strict=True):
-            table[name or "name"] = _plain_column(cells)
-        write_table(path, table)
+        for heading, *cells in zip(self.headings, *self.rows, strict=True):
+            name, unit = _name_and_unit(heading)
+            if path.suffix.lower() == ".fits":
+                name, cells = _ascii(name), [_ascii(cell) for cell in cells]
+            for suffix, values in _plain_columns(cells).items():
+                column = _unused(name + suffix, table.colnames)
+                table[column] = values
+                if unit and not any(isinstance(value, str) for value in values):
+                    table[column].unit = unit
+        write_table(path, flat_table(table) if path.suffix.lower() in (".csv", ".parquet") else table)
+
+
+def write_rows(rows: Rows, path: Path | None) -> None:
+    """Write a table where it has a path."""
+    if path is not None:
+        rows.write(path)
+
+
+def _name_and_unit(heading: str) -> tuple[str, Any]:
+    """Return the name and the unit of a heading such as ``rms [nm]``; no unit where astropy has none of that name."""
+    from astropy.units import Unit
+
+    match = re.fullmatch(r"(.*?)\s*\[([^][]+)\](.*)", heading)
+    if match is None:
+        return heading or "name", None
+    try:
+        unit = Unit("arcsec" if match[2] == '"' else match[2])
+    except (ValueError, TypeError):
+        return heading, None
+    return f"{match[1]}{match[3]}".strip() or "value", unit
+
+
+def _plain_columns(cells: list[str]) -> dict[str, list[float] | list[str]]:
+    """Return columns of cells by the ends of their names: numbers with an error behind ± or +- are two."""
+    pairs = [re.split(r" ?(?:±|\+-) ?", cell) for cell in cells]
+    if cells and all(len(pair) == 2 for pair, cell in zip(pairs, cells, strict=True) if cell not in ("", "-")):
+        values, errors = (_plain_column([(*pair, "", "")[k] for pair in pairs]) for k in (0, 1))
+        if any(len(pair) == 2 for pair in pairs):
+            return {"": values, "_error": errors}
+    return {"": _plain_column(cells)}
 
 
 def _plain_column(cells: list[str]) -> list[float] | list[str]:
     """Return the cells of a column as numbers, NaN for dashes and empty ones, or as text where they are none."""
+    if not any(cell not in ("", "-") for cell in cells):
+        return [math.nan] * len(cells)
     try:
         return [math.nan if cell in ("", "-") else float(cell) for cell in cells]
     except ValueError:
         return list(cells)
+
+
+def _unused(name: str, names: Sequence[str]) -> str:
+    """Return a name, with a number behind it where it stands among some already."""
+    numbers = (f"{name}_{k}" for k in range(2, len(names) + 3))
+    return next(candidate for candidate in (name, *numbers) if candidate not in names)
+
+
+def _ascii(text: str) -> str:
+    """Return a text as FITS holds it: Greek letters and signs in ASCII."""
+    for sign, word in _ASCII.items():
+        text = text.replace(sign, word)
+    return text.encode("ascii", "replace").decode()
 
 
 def numbers_of(summary: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Targets of commands, checked before the work: what cannot be written is refused at once."""
+"""Targets of commands, checked before the work: what cannot be written, or is no table, is refused at once."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ def _checked(command: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(command)
     def checked(*given: Any, **options: Any) -> Any:
         from ..core.files import require_writable
+        from .options import check_table
 
+        if isinstance(table := options.get("table"), Path):
+            check_table(table)
         for name, file in TARGETS.items():
             if isinstance(target := options.get(name), Path):
                 require_writable(target, file=file)

@@ -15,7 +15,7 @@ from . import completion
 from .choices import choice, names
 from .imports import import_modules
 from .inputs import load_model, warnings_shown
-from .options import Configuration, GlassCatalogues, Json, Lenient, Model, TableFile, check_table
+from .options import Configuration, GlassCatalogues, Json, Lenient, Model, TableFile
 from .tables import Rows, plain_table, print_json, wide_console
 
 if TYPE_CHECKING:
@@ -49,7 +49,6 @@ def info_command(
     - `pachon info lsst_v3.3_r`
     - `pachon info my_telescope.yaml --json`
     """
-    check_table(table)
     console = wide_console()
     if model is None:
         from ..models.io.bundled import bundled_models

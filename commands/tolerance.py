@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,8 +14,8 @@ from ..core.terminal import print_line
 from . import completion
 from .choices import choice, names
 from .inputs import errors_of, load_model
-from .options import GlassCatalogues, Json, Lenient, Model, Quiet, Threads, set_option
-from .tables import Rows, number_texts, print_json
+from .options import GlassCatalogues, Json, Lenient, Model, Quiet, TableFile, Threads, set_option
+from .tables import Rows, number_texts, print_json, write_rows
 from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 app = typer.Typer()
@@ -48,6 +49,7 @@ def tolerance_command(
     processes: Processes = None,
     scheduler: Scheduler = None,
     workers: DaskWorkers = None,
+    table: TableFile = None,
     settings: Annotated[list[str] | None, set_option("tolerances")] = None,
     threads: Threads = None,
     quiet: Quiet = False,
@@ -89,23 +91,25 @@ def tolerance_command(
         study = run_tolerances(telescope, file, folder / "points.tolerance", execution=execution)
     write_tolerances(study, file, folder)
     summary = tolerance_summary(study)
+    rows = _offender_rows(summary, verdict(summary))
+    write_rows(rows, table)
     if as_json:
         print_json({**summary, "folder": str(folder)})
         return
     if not quiet:
-        print_line(verdict(summary))
-        _show(summary)
+        replace(rows, rows=rows.rows[:_SHOWN]).show()
+        _show_draws(summary)
         if following_stop(telescope) is not telescope:
             print_line(f"rays fill the stop {telescope.design_data.stop}, as with aiming: real")
     print_line(f"tolerances: {folder.resolve()}")
 
 
-def _show(summary: dict[str, Any]) -> None:
-    """Print the costliest tolerances, and the Monte Carlo below."""
+def _offender_rows(summary: dict[str, Any], sentence: str) -> Rows:
+    """Return the costliest tolerances."""
     unit = f" [{summary['unit']}]" if summary["unit"] else ""
     plain = f" {summary['unit']}" if summary["unit"] else ""
     rows = []
-    for offender in summary["worst_offenders"][:_SHOWN]:
+    for offender in summary["worst_offenders"]:
         size_unit = "" if offender["unit"] == "1" else f" {offender['unit']}"
         ends = number_texts([offender["lower_end"], offender["upper_end"]], ".5g")
         rows.append(
@@ -118,7 +122,12 @@ def _show(summary: dict[str, Any]) -> None:
         )
     headings = ("tolerance", "size", f"lower end{unit}", f"upper end{unit}", f"{summary['loss_percent']:g} % loss at")
     caption = f"The costliest of {summary['tolerances']}; as designed {summary['nominal']:.5g}{plain}."
-    Rows(headings, rows, caption).show()
+    return Rows(headings, rows, caption, verdict=sentence)
+
+
+def _show_draws(summary: dict[str, Any]) -> None:
+    """Print the Monte Carlo."""
+    plain = f" {summary['unit']}" if summary["unit"] else ""
     reached = ", ".join(f"{p} % {summary[f'reached_by_{p}_percent']:.5g}" for p in (50, 80, 95))
     lost = f"; {summary['lost']} without light" if summary["lost"] else ""
     print_line(f"{summary['draws']} telescopes, {summary['method']}: reached by {reached}{plain}{lost}")

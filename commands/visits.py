@@ -13,8 +13,9 @@ from ..core.terminal import print_line
 from . import completion
 from .choices import names
 from .night import Bands, ListFile, Night, Where, names_list, night_settings, part_of, require_list, show_night
-from .options import AllCcds, Ccds, Config, Json, Quiet, Raft, Threads, chosen_ccds, set_option
-from .tables import Rows, print_json
+from .options import AllCcds, Ccds, Config, Json, Quiet, Raft, TableFile, Threads, chosen_ccds, set_option
+from .tables import Rows, print_json, write_rows
+from .verdicts import null_verdict, visits_verdict
 from .workers import DaskWorkers, Processes, Scheduler, long_work
 
 app = typer.Typer()
@@ -81,6 +82,7 @@ def visits_command(
     processes: Processes = None,
     scheduler: Scheduler = None,
     workers: DaskWorkers = None,
+    table: TableFile = None,
     settings: Annotated[list[str] | None, set_option("visits")] = None,
     threads: Threads = None,
     quiet: Quiet = False,
@@ -118,6 +120,7 @@ def visits_command(
     from ..core.set_keys import with_set_keys
     from ..pipeline.config import with_options
     from ..studies.night.config import ListSection
+    from ..studies.night.night import run_night
     from ..studies.visits.config import VisitsConfig, load_visits_configuration
     from ..studies.visits.visits import stack_visits
 
@@ -155,7 +158,8 @@ def visits_command(
             quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
         ) as execution:
             base_folder = None if config is None else config.parent
-            show_night(night_config, out, base_folder, part_of(part), execution, quiet=quiet, as_json=as_json)
+            result = run_night(night_config, out, base=base_folder, part=part_of(part), execution=execution)
+        show_night(result, out, table, quiet=quiet, as_json=as_json)
         return
     if not stack:
         require_list(
@@ -181,10 +185,12 @@ def visits_command(
         quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
     ) as execution:
         result = stack_visits(visits_config, out, experiment=experiment, execution=execution)
+    rows = _stack_rows(result.summary["stacks"])
+    write_rows(rows, table)
     if as_json:
         print_json(result.summary)
     elif not quiet:
-        _show(result.summary["stacks"])
+        rows.show()
         print_line(f"visits: {out.resolve()}")
 
 
@@ -198,7 +204,7 @@ def angles_of(option: str, text: str | None) -> str | tuple[float, ...] | None:
         raise ConfigError(f"{option} = {text}: expected random, or angles in degrees with commas between") from None
 
 
-def _show(stacks: dict[str, dict[str, float]]) -> None:
+def _stack_rows(stacks: dict[str, dict[str, float]]) -> Rows:
     columns = {
         "g of the PSF": "rms_g",
         "residual, stars": "rms_residual_g_stars",
@@ -215,7 +221,7 @@ def _show(stacks: dict[str, dict[str, float]]) -> None:
         (visits, str(stack_metrics["points"]), *(f"{stack_metrics[key]:.1e}" for key in columns.values()))
         for visits, stack_metrics in stacks.items()
     ]
-    Rows(headings, rows, _CAPTION).show()
+    return Rows(headings, rows, _CAPTION, verdict=visits_verdict(stacks))
 
 
 @app.command("null-test")
@@ -227,6 +233,7 @@ def null_test_command(
     processes: Processes = None,
     scheduler: Scheduler = None,
     workers: DaskWorkers = None,
+    table: TableFile = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -254,22 +261,29 @@ def null_test_command(
     ) as execution:
         results = null_test(folder, tiles=tiles, rings=rings, execution=execution)
     metrics_by_visits = {str(visits): null_metrics(result) for visits, result in results.items()}
+    rows = _null_rows(metrics_by_visits)
+    write_rows(rows, table)
     if as_json:
         print_json({"stacks": metrics_by_visits})
     elif not quiet:
-        keys = ("mean_abs_xi_plus", "shot_noise_xi_plus", "xi_plus_difference_long")
-        rows = []
-        for visits, metrics in metrics_by_visits.items():
-            biases = [
-                f"{metrics[name]:.4f} ± {metrics[f'{name}_error']:.4f}"
-                for name in ("m1_model", "c1_model", "m1_true", "c1_true")
-            ]
-            density = f"{metrics['usable_per_arcmin2']:.1f}"
-            rows.append((visits, density, *(f"{metrics[key]:.1e}" for key in keys), *biases))
-        headings = ("visits", "per arcmin²", "|ξ+|", "shot noise", "difference", "m1", "c1", "m1 true", "c1 true")
-        Rows(headings, rows, _NULL_CAPTION).show()
+        rows.show()
         _show_shears(metrics_by_visits)
         print_line(f"null test: {folder.resolve()}")
+
+
+def _null_rows(metrics_by_visits: dict[str, dict[str, float]]) -> Rows:
+    """Return what Gaussians measure, stack by stack."""
+    keys = ("mean_abs_xi_plus", "shot_noise_xi_plus", "xi_plus_difference_long")
+    rows = []
+    for visits, metrics in metrics_by_visits.items():
+        biases = [
+            f"{metrics[name]:.4f} ± {metrics[f'{name}_error']:.4f}"
+            for name in ("m1_model", "c1_model", "m1_true", "c1_true")
+        ]
+        density = f"{metrics['usable_per_arcmin2']:.1f}"
+        rows.append((visits, density, *(f"{metrics[key]:.1e}" for key in keys), *biases))
+    headings = ("visits", "per arcmin²", "|ξ+|", "shot noise", "difference", "m1", "c1", "m1 true", "c1 true")
+    return Rows(headings, rows, _NULL_CAPTION, verdict=null_verdict(metrics_by_visits))
 
 
 def _show_shears(metrics_by_visits: dict[str, dict[str, float]]) -> None:

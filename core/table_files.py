@@ -16,7 +16,7 @@ from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
 from .errors import ConfigError, PachonError, ProductError
 from .files import parsing, read_bytes, text_lines, write_bytes
-from .products import Card, card_text
+from .products import Card, Columns, card_text
 
 #: Formats of astropy, or Parquet, by the ending of the file.
 FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits", ".parquet": "parquet"}
@@ -105,11 +105,31 @@ def _encoded(table: Table, kind: str, path: Path, images: Mapping[str, Described
         file_data = io.BytesIO()
         hdus.writeto(file_data)
         return file_data.getvalue()
-    parquet = parquet_module(path, ConfigError)
+    columns: Columns = {name: (np.asarray(table[name]), "", "") for name in table.colnames}
+    return parquet_bytes(path, columns, error=ConfigError)
+
+
+def parquet_bytes(
+    path: Path, columns: Columns, meta: Mapping[str, Any] = MappingProxyType({}), *, error: type[PachonError]
+) -> bytes:
+    """Return columns as the content of a Parquet file, with unit and description of those that have them.
+
+    Without pyarrow an error of the class given names the file.
+    """
+    parquet = parquet_module(path, error)
     import pyarrow
 
-    arrays = {name: pyarrow.array(np.asarray(table[name]).tolist()) for name in table.colnames}
-    parquet.write_table(pyarrow.table(arrays), data)
+    arrays, fields = [], []
+    for name, (values, unit, description) in columns.items():
+        # pyarrow takes text and rows of several numbers as lists, and the bytes of numbers in the machine's order.
+        plain = values.ndim == 1 and values.dtype.kind in "biuf"
+        array = pyarrow.array(values.astype(values.dtype.newbyteorder("=")) if plain else values.tolist())
+        about = {"unit": unit, "description": description} if unit or description else None
+        arrays.append(array)
+        fields.append(pyarrow.field(name, array.type, metadata=about))
+    schema = pyarrow.schema(fields, metadata={key: str(value) for key, value in meta.items()} or None)
+    data = io.BytesIO()
+    parquet.write_table(pyarrow.Table.from_arrays(arrays, schema=schema), data)
     return data.getvalue()
 
 

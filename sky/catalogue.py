@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +14,7 @@ from ..core.arguments import check_arguments
 from ..core.errors import DomainError, ProductError, error_context
 from ..core.files import write_bytes
 from ..core.products import Columns, table_hdu, write_ecsv, write_fits
-from ..core.table_files import parquet_module, read_columns
+from ..core.table_files import parquet_bytes, read_columns
 from ..core.units import radians
 from ..models.camera.photometry import BandName
 from .galaxies import Galaxies
@@ -143,12 +142,7 @@ def write_galaxies(path: str | Path, galaxies: Galaxies) -> None:
     elif kind == "FITS":
         write_fits(path, [table_hdu("COMPONENTS", columns)], None, [])
     else:
-        parquet = parquet_module(path, ProductError)
-        import pyarrow
-
-        data = io.BytesIO()
-        parquet.write_table(pyarrow.table({name: values for name, (values, _, _) in columns.items()}), data)
-        write_bytes(path, data.getvalue())
+        write_bytes(path, parquet_bytes(path, columns, error=ProductError))
 
 
 def _column_values(

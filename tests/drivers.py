@@ -7,6 +7,8 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
+
 
 def start(folder, *arguments):
     """Start a command in a folder; what it says on standard error is kept."""
@@ -71,3 +73,42 @@ def seconds_that_children_outlive(driver):
     seconds = time.monotonic() - begin
     driver.communicate()
     return seconds
+
+
+def killed_again_and_again(begin, content, folder, kills, *, resumes=True, after_kill=lambda out, expected: None):
+    """Kill work with -9 at random instants; each time that it reaches its end its content is that of whole work.
+
+    `begin(out)` starts the work that leaves `out`, or goes on with what is there, in a process; `after_kill` checks
+    what a killed one has left. Returns how often it reached its end, and the seconds of whole work.
+    """
+
+    def whole(out):
+        process = begin(out)
+        process.join()
+        assert process.exitcode == 0
+        return content(out)
+
+    expected = whole(folder / "warm")
+    assert len(expected) > 0
+    start_time = time.monotonic()
+    assert whole(folder / "timed") == expected
+    seconds = time.monotonic() - start_time
+    rng, killed, ended = np.random.default_rng(7), 0, 0
+    out = folder / "killed0"
+    while killed < kills:
+        # What is left of work that goes on is shorter.
+        longest = 0.5 * seconds if resumes and content(out) else seconds
+        process = begin(out)
+        process.join(rng.uniform(0.0, longest))
+        if process.exitcode is None:
+            process.kill()
+            process.join()
+            killed += 1
+            after_kill(out, expected)
+            continue
+        assert process.exitcode == 0
+        assert content(out) == expected
+        ended += 1
+        out = folder / f"killed{ended}"
+    assert whole(out) == expected
+    return ended + 1, seconds

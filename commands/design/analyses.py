@@ -19,7 +19,7 @@ Points = Annotated[int, Option(min=3, max=10001, help="Rays along each diameter 
 
 @design_command(
     FIELD,
-    Column("largest, tangential, sagittal [µm]", "largest_um", ".3f"),
+    Column("largest, tangential, sagittal [µm]", "largest_um", ".3f", subject="The largest transverse aberration"),
     caption="Transverse aberration along each fan against the chief ray of the middle wavelength.",
     band=True,
 )
@@ -40,7 +40,7 @@ def fans(shared: SharedOptions, points: Points = 65) -> Study:
 
 @design_command(
     FIELD,
-    Column("peak to valley [waves]", "peak_to_valley_waves", ".4f"),
+    Column("peak to valley [waves]", "peak_to_valley_waves", ".4f", subject="The peak to valley of the wavefront"),
     caption="Over both fans, a number for each wavelength; reference sphere of {reference_sphere_m:.6g} m.",
     band=True,
 )
@@ -59,7 +59,7 @@ def opd_fans(shared: SharedOptions, points: Points = 65) -> Study:
 
 @design_command(
     FIELD,
-    Column("tangential focus [µm]", "tangential_focus_um", ".3f"),
+    Column("tangential focus [µm]", "tangential_focus_um", ".3f", subject="The tangential focus"),
     Column("sagittal focus [µm]", "sagittal_focus_um", ".3f"),
     Column("distortion [%]", lambda result: result.distortion, ".5f"),
     caption="A number for each wavelength; foci are behind the detector as light travels.",
@@ -83,7 +83,7 @@ def field_curvature(shared: SharedOptions) -> Study:
 @design_command(
     FIELD,
     Column("shift [µm]", "shift_um", ".4f"),
-    Column("spread [µm]", "spread_um", ".4f"),
+    Column("spread [µm]", "spread_um", ".4f", subject="The spread of the colours"),
     Column("Airy [µm]", "airy_radius_um", ".3f"),
     caption="Shift of the chief ray of each wavelength along the field, against {reference_nm:.6g} nm.",
     band=True,
@@ -165,7 +165,10 @@ def _matrix_heading(summary: dict[str, Any]) -> str:
 
 
 @design_command(
-    FIELD, Column(_matrix_heading, "rms_radius_um", ".3f"), Column("Airy [µm]", "airy_radius_um", ".3f"), band=True
+    FIELD,
+    Column(_matrix_heading, "rms_radius_um", ".3f", subject="The rms radius of the spots"),
+    Column("Airy [µm]", "airy_radius_um", ".3f"),
+    band=True,
 )
 def spot_matrix(
     shared: SharedOptions,

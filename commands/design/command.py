@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypedDict
@@ -68,6 +68,7 @@ class Outcome:
     table: Callable[[Any], Rows] | None = None  #: function from the result to a table, in place of the columns
     stem: str | None = None  #: name of the picture without its end; by default those of command and telescope
     notes: Sequence[str] = ()  #: lines below the table
+    verdict: str = ""  #: result in one sentence, above the table; that of the table where empty
 
 
 class TraceOptions(TypedDict):
@@ -150,12 +151,14 @@ def design_command(
     left: int = 1,
     band: bool = False,
     most: int | None = None,
+    verdict: str | Callable[[dict[str, Any]], str] = "",
 ) -> Callable[[Callable[..., Study | Outcome]], Callable[..., Study | Outcome]]:
     """Make a command of a function, with the columns of its table, and add it to :data:`app`.
 
     The caption is a text, with fields of the summary in braces, or a function of the summary; `left` is the number of
     columns of names. With `band` the command takes several wavelengths or the pass band, not one wavelength. Of a
-    longer table `most` rows are shown.
+    longer table `most` rows are shown. Above it stands the verdict, a text or function like the caption, or the range
+    of a column with a subject.
     """
 
     def rows(result: Study) -> Rows:
@@ -167,7 +170,10 @@ def design_command(
         lines = [*zip(*cells, strict=True)]
         if most is not None and len(lines) > most:
             text += f" Shown are the first {most}, {len(lines) - most} more follow them: --json has all."
-        return Rows([column.title(summary) for column in shown], lines[:most], text, left)
+        sentence = verdict.format_map(summary) if isinstance(verdict, str) else verdict(summary)
+        headlines = [column.verdict(result, summary) for column in shown if column.subject]
+        headings = [column.title(summary) for column in shown]
+        return Rows(headings, lines[:most], text, left, " ".join(filter(None, (sentence, *headlines))))
 
     def build(compute: Callable[..., Study | Outcome]) -> Callable[..., Study | Outcome]:
         name = compute.__name__.replace("_", "-")
@@ -175,7 +181,6 @@ def design_command(
 
         def command(picture: Path | None, no_picture: bool, table: Path | None, as_json: bool, **values: Any) -> None:
             kind = options.picture_kind(picture)
-            options.check_table(table)
             import_modules(_NEEDED)
             shared = SharedOptions(**{f.name: values[f.name] for f in fields(SharedOptions) if f.name in values})
             try:
@@ -242,7 +247,8 @@ def _deliver(
     if as_json:
         print_json({**outcome.result.summary(), **written})
         return
-    rows(outcome.result).show()
+    table_rows = rows(outcome.result)
+    (replace(table_rows, verdict=outcome.verdict) if outcome.verdict else table_rows).show()
     for note in outcome.notes:
         print_line(note)
     for name, path in written.items():

@@ -11,7 +11,7 @@ from typer import Option
 from ...core.errors import ConfigError
 from .. import completion
 from ..choices import names
-from ..tables import Column, Rows, field_headings, number_texts
+from ..tables import Column, Rows, field_headings, number_texts, range_text
 from .command import Outcome, SharedOptions, design_command
 
 if TYPE_CHECKING:
@@ -55,7 +55,9 @@ def _distortion_rows(result: Distortion) -> Rows:
         ("largest shift from the best picture", result.image_text(f"{1e6 * result.largest_shift:.3f} µm")),
         ("rms shift", result.image_text(f"{1e6 * result.rms_shift:.3f} µm")),
     ]
-    return Rows(("metric", "value"), rows, f"{s['telescope']}, {s['wavelength_nm']:g} nm, {len(result.fields)} fields")
+    caption = f"{s['telescope']}, {s['wavelength_nm']:g} nm, {len(result.fields)} fields"
+    verdict = f"Distortion reaches {s['largest_percent']:.4f} % against the scale that fits best over the field."
+    return Rows(("metric", "value"), rows, caption, verdict=verdict)
 
 
 def _length(metres: float) -> str:
@@ -97,8 +99,9 @@ def _vignetting_rows(result: Vignetting) -> Rows:
         light, error = 100.0 * result.relative[ring], 100.0 * result.error[ring].max() / result.axis_fraction
         rows.append((f"{r:g}", f"{light.mean():.2f}", f"{light.min():.2f}", f"{light.max():.2f}", f"{error:.2f}"))
     headings = (label, "light [%]", "least", "most", "error of one field")
+    verdict = f"The light that arrives is {range_text(100.0 * result.relative, '.2f', '%')} of that on the axis."
     caption = f"Relative to the axis, where {100 * result.axis_fraction:.2f} % of the annular pupil is lit."
-    return Rows(headings, rows, caption)
+    return Rows(headings, rows, caption, verdict=verdict)
 
 
 @design_command()

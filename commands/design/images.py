@@ -9,11 +9,15 @@ from typer import Option
 
 from ...core.errors import ConfigError
 from ...core.terminal import print_line
+from .. import completion
+from ..choices import names
 from ..tables import FIELD, Column
 from .command import SharedOptions, Study, design_command
 
 #: Pairs of surfaces whose ghosts take longer than ten seconds.
 _MANY_PAIRS = 200
+#: What a radius of encircled energy stands for in the verdict: one is enough.
+_SUBJECTS = {(80, "µm"): "The radius of 80 % of the light"}
 PupilPoints = Annotated[
     int | None, Option(min=16, max=4096, help="Lattice points across the pupil; enough by default.")
 ]
@@ -31,7 +35,7 @@ def _pixels_text(s: dict[str, Any]) -> str:
 
 @design_command(
     FIELD,
-    Column("Strehl", "strehl", ".4f"),
+    Column("Strehl", "strehl", ".4f", subject="The Strehl ratio"),
     Column("FWHM [µm]", "fwhm_um", ".3f"),
     Column("FWHM [arcsec]", "fwhm_arcsec", ".4f"),
     Column("Airy [µm]", "airy_radius_um", ".3f"),
@@ -61,6 +65,8 @@ def psf(
     from ...core.products import image_hdu, write_fits
     from ...design.images.diffraction import fft_psf, huygens_psf
 
+    if out is not None and out.suffix.lower() not in (".fits", ".fit"):
+        raise ConfigError(f"--out = {str(out)!r}: expected a name that ends in .fits; the picture is --picture")
     if huygens and pupil_points is not None:
         raise ConfigError("--huygens and --pupil-points: expected one of them")
     compute = huygens_psf if huygens else fft_psf
@@ -80,7 +86,9 @@ def psf(
 @design_command(
     FIELD,
     *(
-        Column(f"{fraction} % [{unit}]", f"ee{fraction}_radius_{key}", form)
+        Column(
+            f"{fraction} % [{unit}]", f"ee{fraction}_radius_{key}", form, subject=_SUBJECTS.get((fraction, unit), "")
+        )
         for fraction in (50, 80, 90)
         for unit, key, form in (("µm", "um", ".3f"), ("arcsec", "arcsec", ".4f"))
     ),
@@ -114,7 +122,7 @@ def ee(
 
 @design_command(
     FIELD,
-    Column("50 % [cycles/mm]", "half_contrast_cycles_per_mm", ".2f"),
+    Column("50 % [cycles/mm]", "half_contrast_cycles_per_mm", ".2f", subject="The frequency of half contrast"),
     Column("50 % [cycles/arcsec]", "half_contrast_cycles_per_arcsec", ".3f"),
     Column("cut-off [cycles/mm]", "cutoff_cycles_per_mm", ".1f"),
     Column("f/", "f_number", ".4f"),
@@ -152,8 +160,9 @@ def mtf(
     Column("focus [mm]", "focus_mm", ".2f"),
     caption=lambda s: (
         "Light and peak over the light of the star's own image; magnitudes below the star's own. Focus: height "
-        f"above the detector. All ghosts together hold {100 * s['total_flux']:.3g} % of the star's light."
+        "above the detector."
     ),
+    verdict=lambda s: f"All ghosts together hold {100 * s['total_flux']:.3g} % of the star's light.",
     left=2,
     most=20,
 )
@@ -168,8 +177,10 @@ def ghosts(
     ] = None,
     reflectivity: Annotated[
         list[str] | None,
-        Option(
-            metavar="R | NAME=R", help="Of the lens surfaces, one for all or by name; by default that of bare glass."
+        names(
+            completion.coated_surfaces,
+            metavar="R | NAME=R",
+            help="Of the lens surfaces, one for all or by name; by default that of bare glass.",
         ),
     ] = None,
     detector_reflectivity: Annotated[float, Option(min=0.0, max=1.0, help="Of the detector.")] = 0.15,

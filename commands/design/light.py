@@ -9,7 +9,7 @@ from typer import Option
 
 from ...core.errors import ConfigError
 from ..options import degrees_pair
-from ..tables import FIELD, Column, Rows
+from ..tables import FIELD, Column, Rows, range_text
 from .command import Outcome, SharedOptions, Study, design_command
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ _Coatings = Annotated[Path | None, Option(metavar="FILE.yaml", help="Coatings of
 
 @design_command(
     FIELD,
-    Column("relative illumination [%]", lambda result: 100 * result.relative, ".3f"),
+    Column("relative illumination [%]", lambda r: 100 * r.relative, ".3f", subject="The relative illumination"),
     Column("lit part of the pupil [%]", lambda result: 100 * result.lit_fraction, ".3f"),
     caption="By the projected solid angle of the exit pupil; a uniform source.",
 )
@@ -68,16 +68,16 @@ def _throughput_rows(result: Throughput) -> Rows:
         (f"{w * 1e9:.6g}", *(f"{100 * v:.3f}" for v in column))
         for w, column in zip(result.wavelengths, result.value.T, strict=True)
     ]
-    return Rows(
-        headings, rows, f"{result.telescope}: light on the detector over light on the annular pupil [%].", left=0
-    )
+    caption = f"{result.telescope}: light on the detector over light on the annular pupil [%]."
+    verdict = f"The throughput is {range_text(100.0 * result.value, '.3g', '%')} over fields and wavelengths."
+    return Rows(headings, rows, caption, left=0, verdict=verdict)
 
 
 @design_command(
     FIELD,
     Column("rms wavefront [nm]", "rms_wavefront_nm", ".3f"),
     Column("of the rms", "strehl_of_rms", ".4f"),
-    Column("of the wavefront", "strehl_of_wavefront", ".4f"),
+    Column("of the wavefront", "strehl_of_wavefront", ".4f", subject="The Strehl ratio of the wavefront"),
     Column("of the PSF", lambda result: result.psf, ".4f"),
     caption="Piston and tilt removed; a number for each wavelength; a dash: too steep for the points of the pupil.",
     band=True,

@@ -8,7 +8,7 @@ from typer import Option
 
 from ...core.errors import ConfigError
 from ..choices import choice
-from ..tables import FIELD, Column, Rows, field_headings, number_texts, numbers_of
+from ..tables import FIELD, Column, Rows, field_headings, number_texts, numbers_of, range_text
 from .command import Outcome, SharedOptions, Study, design_command
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @design_command(
     FIELD,
-    Column("rms [µm]", "rms_radius_um", ".3f"),
+    Column("rms [µm]", "rms_radius_um", ".3f", subject="The rms radius of the spots"),
     Column("rms [arcsec]", "rms_radius_arcsec", ".4f"),
     Column("80 % [µm]", "radius_80_percent_um", ".3f"),
     Column("80 % [arcsec]", "radius_80_percent_arcsec", ".4f"),
@@ -71,7 +71,7 @@ def _largest(strehl: np.ndarray) -> np.ndarray:
     Column("best for the wavefront [µm]", "best_focus_wavefront_um", "+.3f"),
     Column("smallest rms [nm]", lambda result: result.rms_wavefront.min(axis=1), ".2f", 1e9),
     Column("largest Strehl", lambda result: _largest(result.strehl), ".4f"),
-    caption="The spots of all fields together are smallest at {best_focus_common_um:+.3f} µm.",
+    verdict="The spots of all fields together are smallest with the detector at {best_focus_common_um:+.3f} µm.",
     band=True,
 )
 def focus(
@@ -160,7 +160,18 @@ def zernikes(
 def _rows(result: FieldZernikes) -> Rows:
     """Return every term at every field."""
     summary = numbers_of(result.summary())
-    return _terms(summary, field_headings(result), summary["zernike_nm"])
+    return _terms(summary, field_headings(result), summary["zernike_nm"], _rms_verdict(result))
+
+
+def _rms_verdict(result: FieldZernikes) -> str:
+    """Return the rms of the terms beyond tilt; empty of Fringe terms, whose amplitudes are no rms."""
+    import numpy as np
+
+    if result.summary()["ordering"] != "noll":
+        return ""
+    rms = 1e9 * np.sqrt((result.coefficients[:, 3:] ** 2).sum(axis=1))
+    over = f" over {len(rms)} fields" if len(rms) > 1 else ""
+    return f"The terms from defocus on have {range_text(rms, '.2f', 'nm')} rms{over}."
 
 
 def _map_rows(result: FieldZernikes) -> Rows:
@@ -169,7 +180,7 @@ def _map_rows(result: FieldZernikes) -> Rows:
 
     nm = 1e9 * result.coefficients
     values = [nm.mean(axis=0), np.sqrt((nm**2).mean(axis=0)), nm.min(axis=0), nm.max(axis=0)]
-    return _terms(result.summary(), ["mean", "rms", "least", "largest"], values)
+    return _terms(result.summary(), ["mean", "rms", "least", "largest"], values, _rms_verdict(result))
 
 
 def term_labels(count: int, ordering: ZernikeOrdering = "noll") -> list[str]:
@@ -179,11 +190,11 @@ def term_labels(count: int, ordering: ZernikeOrdering = "noll") -> list[str]:
     return [term_label(j, ordering) for j in range(1, count + 1)]
 
 
-def _terms(summary: dict[str, Any], headings: list[str], columns: Iterable[np.ndarray]) -> Rows:
+def _terms(summary: dict[str, Any], headings: list[str], columns: Iterable[np.ndarray], verdict: str) -> Rows:
     cells = [number_texts(values, ".2f") for values in columns]
     caption = "{telescope}, {wavelength_nm:g} nm; {pupil} pupil, obscuration {obscuration:g}; nm".format_map(summary)
     labels = term_labels(len(cells[0]), summary["ordering"])
-    return Rows(["term", *headings], [*zip(labels, *cells, strict=True)], caption)
+    return Rows(["term", *headings], [*zip(labels, *cells, strict=True)], caption, verdict=verdict)
 
 
 def _double_rows(result: DoubleZernikes) -> Rows:
@@ -202,7 +213,7 @@ def _double_rows(result: DoubleZernikes) -> Rows:
     FIELD,
     Column("chief ray at [mm]", "chief_landing_mm", ".4f"),
     Column("incidence [deg]", "chief_incidence_deg", ".4f"),
-    Column("f/", "f_number", ".4f"),
+    Column("f/", "f_number", ".4f", subject="The focal ratio"),
     Column("[arcsec/µm]", "plate_scale_arcsec_per_um", ".6f"),
     Column("exit pupil at [mm]", "exit_pupil_distance_m", ".3f", 1e3),
     Column("its diameter [mm]", "exit_pupil_diameter_m", ".3f", 1e3),

@@ -66,10 +66,11 @@ class FittedOpd:
     Column("[nm]", "zernike_nm", ".3f"),
     Column("[waves]", lambda result: result.fit.coefficients / result.opd.wavelength, ".5f"),
     caption=lambda s: (
-        f"{s['model']} at field ({s['field_deg'][0]:g}, {s['field_deg'][1]:g}) deg, {s['wavelength_nm']:g} nm: rms "
-        f"{s['rms_nm']:.2f} nm = {s['rms_waves']:.4f} waves, peak to valley {s['peak_to_valley_nm']:.1f} nm; rms "
-        f"without tilt {s['rms_without_tilt_nm']:.2f} nm; rms residual of the terms {s['residual_rms_nm']:.3f} nm."
+        f"{s['model']} at field ({s['field_deg'][0]:g}, {s['field_deg'][1]:g}) deg, {s['wavelength_nm']:g} nm: peak to "
+        f"valley {s['peak_to_valley_nm']:.1f} nm; rms without tilt {s['rms_without_tilt_nm']:.2f} nm; rms residual of "
+        f"the terms {s['residual_rms_nm']:.3f} nm."
     ),
+    verdict="The wavefront has {rms_nm:.2f} nm rms, {rms_waves:.4f} waves.",
 )
 def opd(
     shared: SharedOptions,

@@ -11,7 +11,7 @@ from ...core.errors import ConfigError, PachonError, error_context
 from .. import completion
 from ..choices import names
 from ..inputs import load_model
-from ..options import GlassCatalogues, Json, Lenient, TableFile, check_table
+from ..options import GlassCatalogues, Json, Lenient, TableFile
 from ..tables import Rows, print_json
 from .command import app
 
@@ -49,7 +49,6 @@ def operands_command(
     - `pachon operands my_lens.zmx`: focal lengths, pupils, Seidel sums, lengths...
     - `pachon operands my_lens.zmx --operand MNCG --operand "MTFA field_deg=0,9 frequency_per_mm=20"`
     """
-    check_table(table)
     if model is None:
         if operand:
             raise ConfigError("--operand is given without MODEL: expected the telescope that it is measured of")

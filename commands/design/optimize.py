@@ -239,7 +239,8 @@ def optimize(
                 yaml_path = path.with_suffix(".yaml")
                 save_telescope(telescope, yaml_path)
                 raise error.within(subject=f"{path}, in place of which {yaml_path.name} was written") from None
-    return Outcome(result, notes=[*_notes(result), *(f"prescription: {path.resolve()}" for path in paths)])
+    verdict, *notes = _notes(result)
+    return Outcome(result, notes=[*notes, *(f"prescription: {path.resolve()}" for path in paths)], verdict=verdict)
 
 
 def _optimized_name(stem: str) -> str:

@@ -84,6 +84,7 @@ def design_report(
         Path(__file__).parent / "templates",
         "design_report.html",
         telescope=telescope,
+        verdict=_verdict(where),
         unit=telescope.length_unit[0],
         columns=COLUMNS,
         rows=rows,
@@ -97,6 +98,25 @@ def design_report(
         problems=problems,
         version=VERSION,
     )
+
+
+def _verdict(where: Where) -> str:
+    """Return the sizes of the spots in one sentence, beside that of the Airy disc."""
+    try:
+        spots = where.spots
+    except PachonError as error:
+        return f"Its spots cannot be traced: {error}."
+    radii = spots.rms_radius[np.isfinite(spots.rms_radius)] * 1e6
+    if not radii.size:
+        return "No ray of any field arrives at the detector."
+    low, high = (f"{radius:.3g}" for radius in (radii.min(), radii.max()))
+    sizes = low if low == high else f"{low} to {high}"
+    fields = "at its one field" if len(spots.fields) == 1 else f"over {len(spots.fields)} fields"
+    dark = len(spots.fields) - len(radii)
+    lost = f"; {dark} of the fields get no light" if dark else ""
+    airy = np.nanmedian(spots.airy_radius) * 1e6
+    unit = spots.image_text("µm")
+    return f"Its spots have {sizes} {unit} rms radius {fields}, the Airy disc has {airy:.3g} {unit} radius{lost}."
 
 
 def _field_texts(request: Request) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +27,7 @@ from ..images.mtf import mtf
 from ..layout.layout import layout
 from ..metrics.field_zernikes import wavefront_zernikes
 from ..metrics.footprint import footprint
-from ..metrics.spots import spots
+from ..metrics.spots import SpotDiagram, spots
 from ..metrics.through_focus import through_focus
 
 if TYPE_CHECKING:
@@ -53,6 +54,11 @@ class Where:
         if self.telescope.design_data.wavelengths:
             return self.wavelengths
         return band_wavelengths(self.telescope, self.wavelengths, 3)
+
+    @cached_property
+    def spots(self) -> SpotDiagram:
+        """Spots of all wavelengths at the fields."""
+        return spots(self.telescope, self.fields, self.colors, sampling="rings", n_pupil=16, threads=self.threads)
 
 
 @dataclass(frozen=True)
@@ -98,7 +104,7 @@ SECTIONS = (
     Section(
         "Spots",
         "Geometric spots of all wavelengths about their centroid; the black circle is the Airy disc.",
-        lambda w: spots(w.telescope, w.fields, w.colors, sampling="rings", n_pupil=16, threads=w.threads).plot(),
+        lambda w: w.spots.plot(),
     ),
     Section(
         "Spots through focus",

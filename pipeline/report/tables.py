@@ -61,13 +61,21 @@ def headline(summary: dict[str, Any]) -> list[tuple[str, str]]:
 
 def verdict(summary: dict[str, Any]) -> str:
     """Return the result of a run in one sentence."""
-    metrics = summary["all"]
+    metrics, lost = summary["all"], len(summary["not_modelled"])
     where = "On one CCD" if metrics["ccds"] == 1 else f"On {metrics['ccds']} CCDs"
+    width = f'{metrics["fwhm_arcsec"]:.3g}" wide' if math.isfinite(metrics["fwhm_arcsec"]) else "of unknown width"
+    keys = {
+        "g": ("mean_g_truth", "rms_residual_g_away", "rms_scatter_g"),
+        "weighted e": ("mean_e_truth", "rms_residual_away", "rms_scatter_e"),
+    }
+    # Images narrower than a pixel have no adaptive moments.
+    name = "g" if all(math.isfinite(metrics[key]) for key in keys["g"]) else "weighted e"
+    mean, residual, scatter = (_percent(metrics[key]) for key in keys[name])
+    constant = "a constant PSF" if metrics["ccds"] == 1 else "a constant PSF on each CCD"
+    left_out = f"; {lost} {'CCD' if lost == 1 else 'CCDs'} could not be modelled" if lost else ""
     return (
-        f'{where} the PSF is {metrics["fwhm_arcsec"]:.2f}" wide with a mean ellipticity |g| of '
-        f"{_percent(metrics['mean_g_truth'])}; where no star is, its model errs by "
-        f"{_percent(metrics['rms_residual_g_away'])} in g, against {_percent(metrics['rms_scatter_g'])} of a constant "
-        "PSF on each CCD."
+        f"{where} the PSF is {width} with a mean ellipticity |{name}| of {mean}; where no star is, its model errs by "
+        f"{residual} in {name}, against {scatter} of {constant}{left_out}."
     )
 
 

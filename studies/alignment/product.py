@@ -61,12 +61,16 @@ def alignment_summary(alignment: Alignment) -> dict[str, Any]:
 
 def verdict(summary: dict[str, Any]) -> str:
     """Return the result of a loop in one sentence."""
-    first = summary["first_visit_within_1.2_floors"]
-    late = f"in late visits misalignment adds {summary['late_added_nm']:.0f} nm"
-    floor = f"of which the telescope cannot correct {summary['floor_added_nm']:.0f} nm"
+    first, limit = summary["first_visit_within_1.2_floors"], f"{CONVERGED:g} times the floor"
+    late = (
+        f"in late visits misalignment adds {summary['late_added_nm']:.0f} nm rms, against a floor of "
+        f"{summary['floor_added_nm']:.0f} nm that no correction can remove"
+    )
     if first is None:
-        return f"Not aligned: {late}, {floor}, and no visit is within {CONVERGED:g} times the floor."
-    return f"Aligned from visit {first} on: {late}, {floor}."
+        return f"Not aligned: no visit comes within {limit}; {late}."
+    if summary["late_worst_wavefront_nm"] <= CONVERGED * summary["floor_wavefront_nm"]:
+        return f"Aligned: visit {first} is the first within {limit}, and all late visits are; {late}."
+    return f"Not aligned throughout: visit {first} is the first within {limit}, but not all late visits are; {late}."
 
 
 def write_alignment(alignment: Alignment, folder: Path) -> tuple[str, ...]:

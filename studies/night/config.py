@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -117,18 +118,31 @@ def read_section(settings: ListSection, run: Configuration, folder: Path | None 
     PachonError if it cannot be read, or its visits are not those of the digest.
     """
     path = (folder or Path()) / str(settings.list)
-    visits = read_visit_list(
-        path,
-        where=settings.where,
-        band=settings.band,
-        night=settings.night,
-        camera=run.camera or ("comcam" if "comcam" in (run.telescope or "") else "lsst"),
-        site=_site_of(run),
-        airmass_law=settings.airmass_law,
-    )
+    camera = run.camera or ("comcam" if "comcam" in (run.telescope or "") else "lsst")
+    selection = settings.where, settings.band, settings.night
+    visits = _visits_of(path, _state_of(path), selection, camera, _site_of(run), settings.airmass_law)
     if settings.digest not in (None, visits.digest):
         raise ProductError("the list has changed: expected the visits of the digest of the configuration", file=path)
     return visits
+
+
+# A database of ten years takes seconds to read: settings are made of it, and then the plan of the visits.
+@lru_cache(maxsize=2)
+def _visits_of(
+    path: Path, state: object, selection: tuple[Any, Any, Any], camera: str, site: str, airmass_law: Any
+) -> VisitList:
+    """Read the list in a file of a state."""
+    where, band, night = selection
+    return read_visit_list(path, where=where, band=band, night=night, camera=camera, site=site, airmass_law=airmass_law)
+
+
+def _state_of(path: Path) -> tuple[int, int] | None:
+    """Return time and size of a file, which change with its content; None where there is none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size
 
 
 def _site_of(run: Configuration) -> str:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ...core.errors import ProductError
 from ...core.files import write_bytes, write_json
 from ...core.products import Columns, Stamp, write_ecsv
 from ...core.statistics import rms
+from ...core.table_files import parquet_bytes
 from ...pipeline.experiment import Experiment
 from ...pipeline.listed_visit import instrument_of
 from ...pipeline.run_folder import SUMMARY_NAME
@@ -116,21 +117,13 @@ def write_night(
 
 def write_named_table(path: Path, columns: Columns, meta: dict[str, Any]) -> None:
     """Write a table as Parquet with units, or as ECSV where there is no writer of Parquet."""
+    file = path.with_suffix(".parquet")
     try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError:
+        content = parquet_bytes(file, columns, meta, error=ProductError)
+    except ProductError:
         write_ecsv(path.with_suffix(".ecsv"), columns, meta)
         return
-    arrays, fields = [], []
-    for name, (values, unit, description) in columns.items():
-        array = pyarrow.array(values.tolist() if values.dtype.kind == "U" else values)
-        arrays.append(array)
-        fields.append(pyarrow.field(name, array.type, metadata={"unit": unit, "description": description}))
-    schema = pyarrow.schema(fields, metadata={key: str(value) for key, value in meta.items()})
-    data = io.BytesIO()
-    parquet.write_table(pyarrow.Table.from_arrays(arrays, schema=schema), data)
-    write_bytes(path.with_suffix(".parquet"), data.getvalue())
+    write_bytes(file, content)
 
 
 def _visit_columns(visits: VisitList) -> Columns:

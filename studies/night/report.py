@@ -58,19 +58,19 @@ def night_page(
 def verdict(summary: Mapping[str, Any]) -> str:
     """Return the result of a night in one sentence."""
     seen = summary["finished"] - len(summary["left_out"])
-    count = f"{seen} of {summary['visits']} visits"
+    count = f"{seen} of {summary['visits']} visits have a PSF"
     bands = summary["bands"]
     if not bands:
-        return f"{count} have a PSF."
+        return f"{count}."
+    limits = {band: bands[band].get("median_magLim", math.nan) for band in bands}
+    depths = ", ".join(f"{band} {limit:.2f}" if math.isfinite(limit) else band for band, limit in limits.items())
+    text = f"{count}; median limiting magnitudes (S/N 5): {depths}"
     best = min(bands, key=lambda band: bands[band].get("error_xi_plus_g_away_short", math.inf))
     value, error = (bands[best].get(f"{key}xi_plus_g_away_short", math.nan) for key in ("", "error_"))
     if math.isnan(value):
-        return f"{count} have a PSF, in {', '.join(bands)}."
-    text = with_error(value, error) if math.isfinite(error) else f"{value:.2g}"
-    return (
-        f"{count} have a PSF, in {', '.join(bands)}; in {best} the models of single visits leave xi+ = {text} in g "
-        "within 10 arcmin, where no star is."
-    )
+        return f"{text}."
+    left = with_error(value, error) if math.isfinite(error) else f"{value:.2g}"
+    return f"{text}; in {best} the models of single visits leave xi+ = {left} in g within 10', where no star is."
 
 
 def _band_row(band: str, metrics: Mapping[str, float], columns: Mapping[str, np.ndarray]) -> list[str]:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import rankdata
 
 from .file import Point, SweepFile
-from .table import SweepTable
+from .table import SweepTable, described_metric
 
 #: Least number of values of a parameter for a curve.
 _CURVE = 2
@@ -201,21 +201,31 @@ def summary(table: SweepTable, sweep: SweepFile) -> dict[str, Any]:
 
 def verdict(summary: dict[str, Any]) -> str:
     """Return the result of a sweep in one sentence: the parameter that matters most for its first metric."""
+    failed = summary["failed"]
+    lost = f" {failed} of {summary['points'] + failed} points could not be computed." if failed else ""
     metrics = {metric: entry for metric, entry in summary["metrics"].items() if entry["range"] is not None}
+    if not metrics:
+        return f"No metric has a value at any of the {summary['points']} computed points.{lost}"
     # Correlations first, as in the pictures.
     for metric in sorted(metrics, key=lambda name: (not name.startswith("xi"), name)):
-        for key, text in (
-            ("largest_change", "{first} matters most for {metric}, which it changes by {size:+.3g} over its range"),
-            ("rank_correlation", "{first} matters most for {metric}, with a rank correlation of {size:+.2f}"),
+        unit = described_metric(metric)[0]
+        for key, form, words in (
+            ("largest_change", ".3g", "which it changes by up to"),
+            ("rank_correlation", ".2f", "with a rank correlation of"),
         ):
-            effects = {name: size for name, size in metrics[metric][key].items() if np.isfinite(size)}
-            ordered = sorted(effects, key=lambda name: -abs(effects[name]))
-            if not ordered or effects[ordered[0]] == 0.0:
+            effects = {name: size for name, size in metrics[metric][key].items() if np.isfinite(size) and size}
+            if not effects:
                 continue
-            sentence = text.format(first=ordered[0], metric=metric, size=effects[ordered[0]])
-            second = f"; next is {ordered[1]} with {effects[ordered[1]]:+.2g}" if len(ordered) > 1 else ""
-            return f"{sentence}{second}."
-    return f"{summary['points']} points are computed; no parameter changes a metric."
+            (first, size), *smaller_effects = sorted(effects.items(), key=lambda item: -abs(item[1]))
+            of_unit = f" {unit}" if unit and key == "largest_change" else ""
+            second = (
+                f"; next is {smaller_effects[0][0]} with {smaller_effects[0][1]:+{form}}{of_unit}"
+                if smaller_effects
+                else ""
+            )
+            matters = "matters most for" if len(metrics[metric][key]) > 1 else "is the one parameter of"
+            return f"{first} {matters} {metric}, {words} {size:+{form}}{of_unit}{second}.{lost}"
+    return f"No parameter changes a metric over the {summary['points']} computed points.{lost}"
 
 
 def _is_numeric(table: SweepTable, name: str) -> bool:

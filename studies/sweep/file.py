@@ -91,7 +91,7 @@ class SweepFile(Section):
     design: Design = Design()
     metrics: tuple[str, ...] = Field(("fwhm", "rms_e", "xi_raw"), description="groups of metrics of each point")
     fields_deg: Annotated[tuple[tuple[Real, Real], ...], Field(min_length=1)] | None = Field(
-        None, description="field angles of a telescope without a camera"
+        None, description="field angles of a telescope without a camera [deg]"
     )
     compensators: tuple[str, ...] = Field((), description="motions solved for the sharpest image before measuring")
     xi_target: Annotated[Real, Field(gt=0)] | None = Field(

@@ -90,7 +90,7 @@ class ToleranceFile(Section):
     wavelengths_nm: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = Field(None, description="[nm]")
     rings: Count = Field(4, description="rings of pupil points")
     frequency_per_mm: Positive | None = Field(
-        None, description="spatial frequency of the merit mtf; of afocal telescopes per mrad"
+        None, description="spatial frequency of the merit mtf [1/mm]; of afocal telescopes per mrad"
     )
     surfaces: SurfaceTolerances = SurfaceTolerances()
     elements: ElementTolerances = ElementTolerances()

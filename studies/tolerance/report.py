@@ -71,15 +71,24 @@ def tolerance_page(
 def verdict(summary: dict[str, Any]) -> str:
     """Return the result of a study in one sentence."""
     unit = f" {summary['unit']}" if summary["unit"] else ""
-    worst = summary["worst_offenders"]
-    costliest = f"; {worst[0]['name']} costs most" if worst else ""
+    draws, lost = summary["draws"], summary["lost"]
+    offender = next(iter(summary["worst_offenders"]), None)
+    # An end without light is NaN, which costs most.
+    costs = offender is not None and any(offender[end] != summary["nominal"] for end in ("lower_end", "upper_end"))
+    costliest = f"; {offender['name']} costs most" if costs else ""
+    dark = f"; {lost} of them have no light" if lost else ""
+    telescopes = "the one telescope drawn" if draws == 1 else f"{draws} telescopes drawn"
     if "yield" in summary:
-        met = f"{100 * summary['yield']['fraction']:.1f} % of {summary['draws']} drawn telescopes"
-        return f"{met} meet the requirement of {summary['requirement']:g}{unit}{costliest}."
-    reached = f"{summary['reached_by_50_percent']:.4g}", f"{summary['reached_by_95_percent']:.4g}{unit}"
+        met = f"{100 * summary['yield']['fraction']:.1f} % of {telescopes}"
+        verb = "meets" if draws == 1 else "meet"
+        return f"{met} {verb} the requirement of {summary['requirement']:g}{unit}{dark}{costliest}."
+    if lost == draws:
+        return f"No light arrives in any of {telescopes}{costliest}."
+    median, high = (summary[f"reached_by_{percent}_percent"] for percent in (50, 95))
+    texts = [f"{value:.4g}{unit}" if math.isfinite(value) else "no light" for value in (median, high)]
     return (
-        f"Half of {summary['draws']} drawn telescopes reach {reached[0]}, 95 % of them {reached[1]}, of "
-        f"{summary['nominal']:.4g}{unit} as designed{costliest}."
+        f"Of {telescopes}, half reach {texts[0]} and 95 % {texts[1]}, where the design has "
+        f"{summary['nominal']:.4g}{unit}{dark}{costliest}."
     )
 
 

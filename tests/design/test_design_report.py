@@ -98,6 +98,8 @@ def test_a_page_without_most_sections(folded, monkeypatch):
     # A flat costs neither first-order data nor Seidel sums.
     assert re.search(r"effective focal length.*2000 mm", page, re.DOTALL)
     assert page.count("<img") == 3
+    # A paraboloid has a point for an image on its axis.
+    assert page.index('<p class="verdict">Its spots have ') < page.index("<img") < page.index("<table")
     off_axis = replace(folded, surfaces=(folded.surfaces[0].moved(shift=(0.1, 0.0, 0.0)), *folded.surfaces[1:]))
     # Seidel sums need a common axis: the report says so.
     page = pachon.design_report(off_axis, [(0.0, 0.0)])

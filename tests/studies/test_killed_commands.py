@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from drivers import children, seconds_that_children_outlive, start, wait_for, workers
+from drivers import children, killed_again_and_again, seconds_that_children_outlive, start, wait_for, workers
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="needs a server of forks")]
 
@@ -91,46 +91,15 @@ def test_a_command_that_is_killed_again_and_again_leaves_the_same_bytes(name, fo
     settings, command = COMMANDS[name]
     (tmp_path / "file.yaml").write_text(yaml.safe_dump(settings))
 
-    def started(out, *more):
-        given = [word.format(file=tmp_path / "file.yaml", out=out) for word in command]
-        process = forks.Process(target=call, args=([*given, *more],))
+    def begin(out):
+        exists = out.exists() or out.with_name(f"{out.name}.sweep").exists()
+        words = [word.format(file=tmp_path / "file.yaml", out=out) for word in command]
+        process = forks.Process(target=call, args=([*words, *(["--resume"] if exists else [])],))
         process.start()
         return process
 
-    def whole(out):
-        process = started(out)
-        process.join()
-        assert process.exitcode == 0
-        return content(out)
-
-    expected = whole(tmp_path / "warm")
-    start = time.monotonic()
-    whole(tmp_path / "timed")
-    seconds = time.monotonic() - start
-    assert len(expected) > 0
-    rng, kills, turn, ended = np.random.default_rng(7), 0, 0, 0
-    out = tmp_path / "killed0"
-    while kills < KILLS:
-        exists = out.exists() or out.with_name(f"{out.name}.sweep").exists()
-        process = started(out, *(["--resume"] if exists else []))
-        # The rest of a run that is resumed is shorter.
-        process.join(rng.uniform(0.0, 0.5 * seconds if exists else seconds))
-        if process.exitcode is None:
-            process.kill()
-            process.join()
-            kills += 1
-            continue
-        assert process.exitcode == 0
-        assert content(out) == expected
-        turn, ended = turn + 1, ended + 1
-        out = tmp_path / f"killed{turn}"
-    if out.exists() or out.with_name(f"{out.name}.sweep").exists():
-        process = started(out, "--resume")
-        process.join()
-        assert process.exitcode == 0
-        assert content(out) == expected
-        ended += 1
-    print(f"{name}: {kills} kills, {ended} commands resumed to their end, {seconds:.1f} s without kills")
+    ended, seconds = killed_again_and_again(begin, content, tmp_path, KILLS)
+    print(f"{name}: {KILLS} kills, {ended} commands resumed to their end, {seconds:.1f} s without kills")
 
 
 #: Ways of a command to have processes of its own: workers, or the process that draws half of the report.

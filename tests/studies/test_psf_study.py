@@ -289,7 +289,7 @@ def test_command_line(settings_file, tmp_path, capsys, monkeypatch):
     assert main([*command, "--ccds", "R22_S11,R24_S12", "--stars", "12,6", "--orders", "1,3", "-o", str(out)]) == 0
     printed = capsys.readouterr()
     assert "ways to model" in printed.err
-    assert "recommended for 12 stars of S/N 30 and more: " in printed.out
+    assert "Recommended for 12 stars of S/N 30 and more: " in printed.out
     assert "could not be fitted" in printed.out
     assert printed.out.endswith(f"study: {out.resolve()}\n")
     names = ["config.yaml", "study.ecsv", "study.json", "study_choices.png", "study_stars.png"]

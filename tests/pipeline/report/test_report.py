@@ -70,6 +70,10 @@ def test_the_report_refers_to_nothing_outside_itself(page):
     assert anchors <= set(re.findall(r'id="([^"]+)"', page))
 
 
+def test_the_report_opens_with_a_sentence_and_a_picture(page):
+    assert page.index('<p class="verdict">On 2 CCDs the PSF is ') < page.index("<img") < page.index("<table")
+
+
 def test_every_picture_is_a_png_without_date_or_software(page):
     reader = Reader()
     reader.feed(page)

@@ -54,7 +54,7 @@ def test_visits_without_models_and_none_at_all():
 def test_a_verdict_of_nights_without_models_or_bands():
     assert verdict({"finished": 2, "visits": 3, "left_out": {"1": "low"}, "bands": {}}) == "1 of 3 visits have a PSF."
     text = verdict({"finished": 3, "visits": 3, "left_out": {}, "bands": {"r": {}}})
-    assert text == "3 of 3 visits have a PSF, in r."
+    assert text == "3 of 3 visits have a PSF; median limiting magnitudes (S/N 5): r."
 
 
 @pytest.mark.long
@@ -76,5 +76,5 @@ def test_a_night_has_the_correlation_of_its_products_and_a_page(night_config, tm
     summary = json.loads((result.folder / "summary.json").read_text())
     assert summary["correlation_g"]["r"]["away"]["visits"] == 1
     page = (result.folder / "report.html").read_text()
-    assert "2 of 3 visits have a PSF, in i, r" in page
+    assert "2 of 3 visits have a PSF; median limiting magnitudes (S/N 5): i " in page
     assert "zenith_angle_deg" in page  # why the second is left out

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from visit_rows import COLUMNS, ROWS
 
-from pachon.core.errors import ConfigError
+from pachon.core.errors import ConfigError, ProductError
 from pachon.core.long_work import Execution
 from pachon.sky.pointing import Pointing
 from pachon.sky.visit_list.read_list import read_visit_list
+from pachon.studies.night import config as night_config
 from pachon.studies.night.config import ListSection
 from pachon.studies.visits.plan import listed_plan
 from pachon.studies.visits.psf_visit import VisitPsfs
@@ -51,6 +52,24 @@ def test_lists_of_several_bands_or_fields_are_no_stack(visits_config, list_file,
     far.write_text(list_file.read_text().replace("53.25,-27.9", "73.25,-27.9"))
     with pytest.raises(ConfigError, match="expected one field"):
         visits_config().with_list(ListSection(list=str(far), band="r"))
+
+
+def test_a_list_is_read_once_while_it_stays_the_same(visits_config, list_file, monkeypatch, tmp_path):
+    path, readings = tmp_path / "own.csv", []
+    path.write_text(list_file.read_text())
+
+    def read(*arguments, **options):
+        readings.append(arguments)
+        return read_visit_list(*arguments, **options)
+
+    monkeypatch.setattr(night_config, "read_visit_list", read)
+    config = visits_config().with_list(ListSection(list=str(path), band="r"))
+    assert len(config.plan(1)) == config.visits.count
+    assert len(readings) == 1
+    path.write_text(list_file.read_text().replace("53.25,-27.9", "53.2501,-27.9"))
+    with pytest.raises(ProductError, match="the list has changed"):
+        config.plan(1)
+    assert len(readings) == 2
 
 
 @pytest.mark.long
