@@ -162,7 +162,15 @@ def wrong_links(folder):
 
 @pytest.mark.slow
 def test_the_pages_are_built_without_warnings(tmp_path):
-    for package in ("sphinx", "furo", "myst_parser", "numpydoc", "sphinx_design", "sphinx_copybutton", "sphinx_gallery"):
+    for package in (
+        "sphinx",
+        "furo",
+        "myst_parser",
+        "numpydoc",
+        "sphinx_design",
+        "sphinx_copybutton",
+        "sphinx_gallery",
+    ):
         pytest.importorskip(package)
     # In a process of its own: pytest makes errors of the warnings of Sphinx's own code.
     command = [sys.executable, "-m", "sphinx", "-W", "-q", "-b", "html", "-d", str(tmp_path / "trees")]
