@@ -1,19 +1,24 @@
 """The gallery runs with its outputs, and the references of the documentation list every public name and command."""
 
+import contextlib
 import importlib.util
+import io
 import re
 import runpy
 import subprocess
 import sys
+from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote
 
+import matplotlib
 import pytest
 from public_names import public_names
 
 from pachon.core.stability import PROVISIONAL
 
 DOCS = Path(__file__).parents[2] / "docs"
-GALLERY = sorted((DOCS / "gallery").glob("[0-9]*.md"))
+GALLERY = sorted((DOCS / "gallery").glob("[0-9]*.py"))
 #: Examples of more than a second; CI builds the pages, and so runs them, all the same.
 LONG = {"20_donuts"}
 
@@ -28,35 +33,37 @@ def pages():
 
 def test_there_are_twenty_examples():
     assert len(GALLERY) >= 20
-    listed = re.findall(r"^(\d\d_\w+)$", (DOCS / "gallery" / "index.md").read_text("utf-8"), flags=re.M)
-    assert listed == [path.stem for path in GALLERY]
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
     "path", [pytest.param(p, marks=[pytest.mark.slow] * (p.stem in LONG), id=p.stem) for p in GALLERY]
 )
-def test_examples_run_and_show_what_they_do(path, pages, tmp_path):
-    text = path.read_text(encoding="utf-8")
-    shown = pages.run_page(text, tmp_path)
-    output = re.search(r"```text\n(.+?)```", shown, flags=re.S)
-    assert output is not None
-    assert "0x" not in output[1]
-    pictures = re.findall(r"!\[.*?\]\(made/(.*?)\)", shown)
+def test_examples_run_and_show_what_they_do(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with matplotlib.rc_context(), contextlib.redirect_stdout(io.StringIO()) as printed:
+        runpy.run_path(str(path))
+    assert printed.getvalue().strip()
+    assert "0x" not in printed.getvalue()
+    pictures = [*tmp_path.glob("*.png")]
     assert pictures
-    for name in pictures:
-        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
-    # An example is short, and the page says what it teaches before it.
-    assert len(pages.BLOCK.findall(text)[0].splitlines()) <= 36
-    assert text.index("```python") > 80
+    assert all(picture.read_bytes().startswith(b"\x89PNG") for picture in pictures)
+    # An example is short, and its page has a title and says what it teaches before the code.
+    text = path.read_text(encoding="utf-8")
+    _, introduction, program = text.split('"""\n', 2)[:3]
+    assert len(program.partition("# %%")[0].strip().splitlines()) <= 36
+    title, line, blank, *sentences = introduction.splitlines()
+    assert (len(line), blank) == (len(title), "")
+    assert len(" ".join(sentences)) > 40
 
 
 def test_every_public_name_is_in_the_reference_with_its_mark(pages):
     reference = "".join(map(pages.api_page, pages.LAYERS))
-    listed = re.findall(r"^\.\. \w+:: (pachon\.[\w.]+)$", reference, flags=re.M)
+    listed = re.findall(r"^   (pachon\.[\w.]+)$", reference, flags=re.M)
     assert sorted(listed) == sorted({*public_names(), "pachon.galsim"})
-    marked = re.findall(r"^\*provisional\*.*\n\n```{eval-rst}\n\.\. \w+:: (pachon\.[\w.]+)$", reference, flags=re.M)
-    assert set(marked) == PROVISIONAL
+    assert set(pages.provisional()) == PROVISIONAL
+    for template in (DOCS / "_templates" / "autosummary").glob("[bc]*.rst"):
+        assert "{% if fullname in provisional %}\n*provisional*" in template.read_text(encoding="utf-8")
 
 
 def test_every_public_name_has_a_docstring():
@@ -68,29 +75,37 @@ def test_every_command_and_option_is_in_the_reference(pages):
 
     from pachon.commands.cli import app
 
-    page, names = pages.command_page(), []
-    sections = dict(re.findall(r"^## (pachon .+?)\n(.*?)(?=^## |\Z)", page, flags=re.M | re.S))
+    text, names = pages.command_pages(), []
+    sections = dict(re.findall(r"^##? (pachon .+?)\n(.*?)(?=^##? |\Z)", "\n".join(text.values()), flags=re.M | re.S))
 
     def check(group, name):
         for key, command in group.commands.items():
             names.append(f"{name} {key}")
             for parameter in command.params:
-                for option in parameter.opts if parameter.param_type_name == "option" else ():
+                shown = parameter.param_type_name == "option" and not parameter.hidden
+                for option in parameter.opts if shown else ():
                     assert f"`{option}`" in sections[names[-1]] or option == "--help", (names[-1], option)
             if hasattr(command, "commands"):
                 check(command, names[-1])
 
-    check(typer.main.get_command(app), "pachon")
+    commands = typer.main.get_command(app)
+    check(commands, "pachon")
     assert sorted(sections) == sorted(names)
     assert len(names) > 30
+    listed = re.findall(r"^- \[`pachon ([\w-]+)`\]\(\1\.md\): \S", pages.command_index(), flags=re.M)
+    assert sorted(listed) == sorted(commands.commands) == sorted(text)
 
 
 def test_pages_show_options_as_they_are_typed(pages, monkeypatch):
     # Texts name options outside of code too, where docutils' "smart quotes" make a dash of two hyphens.
-    text = re.sub(r"```.*?```|`[^`\n]*`", "", pages.command_page(), flags=re.S)
+    text = re.sub(r"```.*?```|`[^`\n]*`", "", "\n".join(pages.command_pages().values()), flags=re.S)
     assert re.search(r"(?<!\S)--\w", text)
+    pytest.importorskip("numpydoc")  # conf.py imports it
     monkeypatch.setattr(sys, "path", [*sys.path])  # conf.py adds to it
-    assert runpy.run_path(str(DOCS / "conf.py"))["smartquotes"] is False
+    monkeypatch.setitem(sys.modules, "pages", pages)
+    settings = runpy.run_path(str(DOCS / "conf.py"))
+    assert settings["smartquotes"] is False
+    assert "suppress_warnings" not in settings
 
 
 @pytest.mark.parametrize("path", [*DOCS.rglob("*.md")], ids=lambda path: path.stem)
@@ -103,22 +118,68 @@ def test_links_within_the_pages_lead_somewhere(path):
         assert anchor in anchors, (target, anchor)
 
 
+class Page(HTMLParser):
+    """Anchors of a page of HTML, its links with their words, and its other files."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.anchors, self.links, self.files, self._words = set(), [], [], None
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        self.anchors |= {values[key] for key in ("id", "name") if values.get(key)}
+        if tag == "a" and values.get("href"):
+            self._words = []
+            self.links.append((values["href"], self._words))
+        if values.get("src"):
+            self.files.append(values["src"])
+
+    def handle_endtag(self, tag):
+        if tag == "a":
+            self._words = None
+
+    def handle_data(self, data):
+        if self._words is not None:
+            self._words.append(data)
+
+
+def wrong_links(folder):
+    """Return each link of built pages to a file or an anchor that is not there, and of "shape" to Window.shape."""
+    parsed = {path.resolve(): Page(path) for path in folder.rglob("*.html")}
+    wrong = []
+    for path, page in parsed.items():
+        for link, words in [*page.links, *((file, []) for file in page.files)]:
+            if re.match(r"[a-z]+:|//", link):
+                continue
+            target, _, anchor = unquote(link).partition("#")
+            goal = (path.parent / target.partition("?")[0]).resolve() if target else path
+            there = goal.is_file() and (not anchor or goal not in parsed or anchor in parsed[goal].anchors)
+            if not there or ("".join(words) == "shape" and anchor.endswith("Window.shape")):
+                wrong.append(f"{path.relative_to(folder.resolve())}: {link}")
+    return wrong
+
+
 @pytest.mark.slow
 def test_the_pages_are_built_without_warnings(tmp_path):
-    for package in ("sphinx", "furo", "myst_parser"):
+    for package in (
+        "sphinx",
+        "furo",
+        "myst_parser",
+        "numpydoc",
+        "sphinx_design",
+        "sphinx_copybutton",
+        "sphinx_gallery",
+    ):
         pytest.importorskip(package)
     # In a process of its own: pytest makes errors of the warnings of Sphinx's own code.
     command = [sys.executable, "-m", "sphinx", "-W", "-q", "-b", "html", "-d", str(tmp_path / "trees")]
     done = subprocess.run([*command, str(DOCS), str(tmp_path / "html")], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    pages = {path.name for path in (tmp_path / "html").rglob("*.html")}
-    assert {"index.html", "commands.html", "api_models.html", "02_spots.html"} <= pages
-    commands = (tmp_path / "html" / "reference" / "commands.html").read_text(encoding="utf-8")
-    assert "goes on by --resume" in commands
-    assert "\N{EN DASH}" not in commands
-    broken = []
-    for page in (tmp_path / "html").rglob("*.html"):
-        for link in re.findall(r'(?:href|src)="([^"#:?]+)"', page.read_text(encoding="utf-8")):
-            if not (page.parent / link).exists():
-                broken.append(f"{page.name}: {link}")
-    assert broken == []
+    built = {path.relative_to(tmp_path / "html").as_posix() for path in (tmp_path / "html").rglob("*.html")}
+    assert {"index.html", "reference/commands/run.html", "reference/api/pachon.spots.html"} <= built
+    assert {f"auto_examples/{path.stem}.html" for path in GALLERY} <= built
+    command_page = (tmp_path / "html" / "reference" / "commands" / "run.html").read_text(encoding="utf-8")
+    assert "--resume" in command_page
+    assert "\N{EN DASH}" not in command_page
+    assert wrong_links(tmp_path / "html") == []
