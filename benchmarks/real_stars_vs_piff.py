@@ -48,10 +48,9 @@ class Stars:
         level, rms = sky_of_stamps(stamps, bad, 0.4 * self.side)
         images = np.where(bad, 0.0, stamps - level[:, None, None])
         self.weight_fwhm = float(np.median(fwhm(images, scale)))
-        filled, _, _ = fill_by_median_star(images, bad, scale, self.weight_fwhm)
-        first = pachon.measure_shapes(filled, scale, self.weight_fwhm)
+        first = fill_by_median_star(images, bad, scale, self.weight_fwhm)
         size = self.side - 4 - (self.side + 1) % 2
-        centred = pachon.measure.center_stamps(filled, first.x, first.y, size, normalize=False)
+        centred = pachon.measure.center_stamps(first.images, first.x, first.y, size, normalize=False)
         selection = pachon.measure.flag_stars(centred, rms, gain=gain)
         bad |= decenter_masks(selection.masks, first.x, first.y, images.shape[1:])
         level, self.rms = sky_of_stamps(stamps, bad, 0.4 * self.side)

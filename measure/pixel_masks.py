@@ -138,7 +138,13 @@ def fill_symmetric(images: np.ndarray, bad: np.ndarray, x: Any = 0.0, y: Any = 0
         paired = inside & (badness < _OVERLAP)
         values = near_good[rows, columns]
         if paired.any():
-            values[paired] = ndimage.map_coordinates(near_good, opposite[:, paired], order=3, mode="nearest")
+            at = opposite[:, paired]
+            on_pixels = np.array_equal(at, np.rint(at))
+            values[paired] = (
+                images[i][tuple(at.astype(int))]
+                if on_pixels
+                else ndimage.map_coordinates(near_good, at, order=3, mode="nearest")
+            )
         filled[i, rows, columns] = values
     return filled
 

@@ -140,9 +140,10 @@ def center_stamps(
     for first in range(0, len(placed), _SHIFTED_TOGETHER):
         indices = placed[first : first + _SHIFTED_TOGETHER]
         shifted = fourier_shifts(stack[indices], *(middle - offsets[indices]).T, rows, columns)
-        total = shifted.reshape(len(indices), -1).sum(axis=1)
-        bright = total > 0.0
-        result[indices[bright]] = shifted[bright] / total[bright, None, None] if normalize else shifted[bright]
+        if normalize:
+            total = shifted.reshape(len(indices), -1).sum(axis=1)
+            shifted /= np.where(total > 0.0, total, np.nan)[:, None, None]
+        result[indices] = shifted
     if masked.any():
         result[masked] = np.where(
             center_masks(bad[masked], offsets[masked, 0], offsets[masked, 1], size), np.nan, result[masked]

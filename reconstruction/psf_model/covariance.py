@@ -87,8 +87,6 @@ class Covariances:
     kernels: np.ndarray  #: columns as in :data:`COLUMNS`, [n_forms, n_columns]
     probabilities: np.ndarray  #: of the forms, of sum 1, [n_forms]
     coloured: bool = False  #: whether kernels have a column of colour terms
-    #: Logarithms where the search of each form ended, improbable ones too, [n_searched, n_columns]; None as of a file.
-    optima: np.ndarray | None = None
 
     @property
     def colour_probability(self) -> float:
@@ -127,15 +125,13 @@ def fit_covariances(
     terms: np.ndarray,
     *,
     colour_count: int = 0,
-    earlier: Covariances | None = None,
 ) -> Covariances:
     """Return the forms that are probable for shape numbers [n, 3], each with its most probable kernel.
 
     They are: trends of degree 0, 1 and 2 without a process, and a process on the linear trend and on that of all
     degrees, as far as the terms reach; where there are colour terms, each without and with them. `points` [n, 2] are
     mapped to [-1, 1], `noise` [n, 3] are the variances of the numbers, `terms` [n, n_terms] those of the trend, the
-    last `colour_count` of which are colour terms. Of nearly the same stars, `earlier` covariances are where each search
-    starts: it ends where the others do.
+    last `colour_count` of which are colour terms.
     """
     unit = np.median(noise, axis=0)
     brightest = np.sort(np.argsort(noise.sum(axis=1), kind="stable")[:_MOST_STARS])
@@ -165,11 +161,6 @@ def fit_covariances(
     processes: list[OptimizeResult] = []
     colour_kinds = (False, True) if colour_count else (False,)
     smooth_degrees = range(min(order, _MOST_SMOOTH_DEGREE) + 1)
-    # Of each kind of colour the smooth forms, the process on a linear trend, and that on all degrees.
-    forms = len(smooth_degrees) + 1 + (order > 1)
-    shape = (len(colour_kinds), forms, len(middle))
-    optima = None if earlier is None else earlier.optima
-    earlier_ends = None if optima is None or optima.size != math.prod(shape) else optima.reshape(shape)
 
     def columns(process: bool, degree: int, colour: bool) -> np.ndarray:
         shared = np.array([process, process, True])
@@ -181,12 +172,9 @@ def fit_covariances(
         costs.append(optimum.fun + _VARIANCE_COST * variances - bonus)
 
     for colour in colour_kinds:
-        if earlier_ends is not None:
-            starts = [earlier_ends[int(colour), -1]]
-        else:
-            starts = [start_at(_PROCESS_START, low_degrees), start_at(_TREND_START, low_degrees)]
-            if order >= _FIRST_HIGH_DEGREE:
-                starts.append(start_at(_TREND_START, all_degrees))
+        starts = [start_at(_PROCESS_START, low_degrees), start_at(_TREND_START, low_degrees)]
+        if order >= _FIRST_HIGH_DEGREE:
+            starts.append(start_at(_TREND_START, all_degrees))
         ends = [posterior.minimize(start, columns(True, order, colour)) for start in starts]
         processes.append(min(ends, key=lambda optimum: optimum.fun))
     # One length for all, so that the mean of all forms has one process.
@@ -194,18 +182,13 @@ def fit_covariances(
     for colour, best in zip(colour_kinds, processes, strict=True):
         for degree in smooth_degrees:
             present = columns(False, degree, colour)
-            start = start_at(_TREND_START, low_degrees) if earlier_ends is None else earlier_ends[int(colour), degree]
-            optimum = posterior.minimize(start, present)
+            optimum = posterior.minimize(start_at(_TREND_START, low_degrees), present)
             add(present, optimum, colour, _CONSTANT_BONUS if degree == 0 else 0.0)
         start, present = best.x.copy(), columns(True, order, colour)
         start[_LENGTH] = length
         if order > 1:
             linear = columns(True, 1, colour)
-            linear_start = start
-            if earlier_ends is not None:
-                linear_start = earlier_ends[int(colour), -2].copy()
-                linear_start[_LENGTH] = length
-            add(linear, posterior.minimize(linear_start, linear, fixed_length=True), colour)
+            add(linear, posterior.minimize(start, linear, fixed_length=True), colour)
         if best.x[_LENGTH] != length:
             best = posterior.minimize(start, present, fixed_length=True)
         add(present, best, colour)
@@ -218,7 +201,6 @@ def fit_covariances(
         kernels[probable],
         probabilities[probable] / probabilities[probable].sum(),
         coloured=colour_count > 0,
-        optima=np.stack([optimum.x for _, optimum in fits]),
     )
 
 
@@ -349,6 +331,26 @@ def krige(
         weights, precision = smooth.solve(values), smooth.precision
     trend = trend_variances(kernel, terms.shape[1], colour_count)[:, None] * (terms.T @ weights)
     return trend, weights, weights / precision[:, None]
+
+
+def inverse_covariance(
+    points: np.ndarray, terms: np.ndarray, kernel: np.ndarray, noise: np.ndarray, colour_count: int = 0
+) -> np.ndarray:
+    """Return the inverse covariance of the values of stars, [n, n]; arguments as those of :func:`krige`."""
+    distances = pair_distances(points, points)
+    covariance = kernel_covariance(kernel, distances, terms, noise, colour_count)
+    return np.asarray(scipy.linalg.inv(covariance, check_finite=False))
+
+
+def differences_left_out(inverse: np.ndarray, weights: np.ndarray, parts: list[np.ndarray]) -> np.ndarray:
+    """Return values less their predictions, [n, k], of each part of the stars by the others (Dubrule 1983).
+
+    `inverse` [n, n] is that of their covariance, `weights` [n, k] its product with the values, `parts` are indices.
+    """
+    differences = np.empty(weights.shape)
+    for part in parts:
+        differences[part] = np.linalg.solve(inverse[np.ix_(part, part)], weights[part])
+    return differences
 
 
 def krige_mean(

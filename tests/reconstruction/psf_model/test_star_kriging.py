@@ -257,34 +257,3 @@ def test_stamps_that_are_not_in_electrons_are_noticed():
         PsfModel.fit(stars, places, **OPTIONS, weights=np.ones(12))
     with pytest.raises(DomainError, match="expected places apart for interpolation = 'kriging'"):
         PsfModel.fit(stars, np.vstack([places[:11], places[:1]]), **OPTIONS)
-
-
-@pytest.mark.long
-def test_a_search_from_earlier_covariances_ends_where_one_without_them_does(monkeypatch):
-    counts = [0]
-    posterior = covariance.Posterior.negative_log_posterior
-
-    def counted(self, *arguments):
-        counts[-1] += 1
-        return posterior(self, *arguments)
-
-    monkeypatch.setattr(covariance.Posterior, "negative_log_posterior", counted)
-
-    def searched(*arguments, **options):
-        counts.append(0)
-        return fit_covariances(*arguments, **options)
-
-    rng = np.random.default_rng(4)
-    for degree, colour_count in ((4, 0), (1, 2)):
-        points, numbers, noise, trend_terms = exact_fields(degree, count=40)
-        terms = np.hstack([trend_terms, (rng.normal(size=(len(points), 1)) * [1.0, 0.5])[:, :colour_count]])
-        earlier = fit_covariances(points, numbers, noise, terms, colour_count=colour_count)
-        nearly_same = numbers + 1e-5 * rng.normal(size=numbers.shape)  # a thousandth of the noise
-        fresh = searched(points, nearly_same, noise, terms, colour_count=colour_count)
-        refined = searched(points, nearly_same, noise, terms, colour_count=colour_count, earlier=earlier)
-        assert counts[-1] < 0.6 * counts[-2]
-        assert list(refined.forms()) == list(fresh.forms())
-        np.testing.assert_allclose(refined.probabilities, fresh.probabilities, rtol=0.0, atol=2e-3)
-        other_terms = covariance.Covariances(earlier.kernels, earlier.probabilities, optima=earlier.optima[:-1])
-        without = fit_covariances(points, nearly_same, noise, terms, colour_count=colour_count, earlier=other_terms)
-        assert np.array_equal(without.kernels, fresh.kernels)
