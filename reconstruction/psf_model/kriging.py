@@ -27,12 +27,12 @@ from .covariance import (
     COLUMNS,
     Covariances,
     differences_left_out,
-    fit_covariances,
     inverse_covariance,
     krige,
     krige_mean,
     predict,
 )
+from .covariance_search import fit_covariances
 from .file_parts import ModelParts
 from .interpolation import FittedInterpolation, Interpolation, StarField
 from .pixel_fields import PixelFields, SignalCovariance, fit_pixel_fields, krige_residuals, residuals_left_out
