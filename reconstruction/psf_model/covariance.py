@@ -93,10 +93,10 @@ class SmoothCovariance:
     log_determinant: np.ndarray  #: [...]
 
     @classmethod
-    def of(cls, kernels: np.ndarray, terms: np.ndarray, noise: np.ndarray, colour_count: int = 0) -> SmoothCovariance:
-        """Return it for kernels, terms of the trend [n, n_terms], the last ones of colours, and noise [n]."""
+    def of(cls, kernels: np.ndarray, terms: np.ndarray, noise: np.ndarray, trend: np.ndarray) -> SmoothCovariance:
+        """Return it for kernels, terms [n, n_terms] with their variances `trend` [..., n_terms], and noise [n]."""
         variance = noise + kernels[..., PROCESS_COLUMNS - 1, None]
-        scaled = terms * np.sqrt(trend_variances(kernels, terms.shape[1], colour_count))[..., None, :]
+        scaled = terms * np.sqrt(trend)[..., None, :]
         over_noise = np.swapaxes(scaled / variance[..., None], -1, -2)
         root = np.linalg.cholesky(np.eye(terms.shape[1]) + over_noise @ scaled)
         log_root = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
@@ -139,7 +139,7 @@ def krige(
         inverse = scipy.linalg.inv(covariance, check_finite=False)
         weights, precision = inverse @ values, np.diagonal(inverse)
     else:
-        smooth = SmoothCovariance.of(kernel, terms, noise, colour_count)
+        smooth = SmoothCovariance.of(kernel, terms, noise, trend_variances(kernel, terms.shape[1], colour_count))
         weights, precision = smooth.solve(values), smooth.precision
     trend = trend_variances(kernel, terms.shape[1], colour_count)[:, None] * (terms.T @ weights)
     return trend, weights, weights / precision[:, None]
@@ -203,16 +203,16 @@ def kernel_covariance(
 ) -> np.ndarray:
     """Return the covariance [n, n] of values at stars of given distances, terms of the trend and noise."""
     decay = kernel[0] * np.exp(-distance / kernel[LENGTH])
-    return with_trend_and_noise(decay, kernel, terms, noise, colour_count)
+    return with_trend_and_noise(decay, kernel, terms, noise, trend_variances(kernel, terms.shape[1], colour_count))
 
 
 def with_trend_and_noise(
-    decay: np.ndarray, kernels: np.ndarray, terms: np.ndarray, noise: np.ndarray, colour_count: int
+    decay: np.ndarray, kernels: np.ndarray, terms: np.ndarray, noise: np.ndarray, trend: np.ndarray
 ) -> np.ndarray:
-    """Return covariances of processes [..., n, n] with those of the trend's terms and of the noise added."""
-    covariance = decay + (terms * trend_variances(kernels, terms.shape[1], colour_count)[..., None, :]) @ terms.T
-    each = np.arange(len(noise))
-    covariance[..., each, each] += noise + kernels[..., PROCESS_COLUMNS - 1, None]
+    """Return covariances of processes [..., n, n] with those of terms of variances `trend` and of the noise added."""
+    covariance = decay + (terms * trend[..., None, :]) @ terms.T
+    diagonals = covariance.reshape(*covariance.shape[:-2], -1)[..., :: len(noise) + 1]
+    diagonals += noise + kernels[..., PROCESS_COLUMNS - 1, None]
     return np.asarray(covariance)
 
 

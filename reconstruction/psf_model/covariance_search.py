@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg
 
+from ..gaussian_field import inverse_from_cholesky
 from .covariance import (
     COLUMNS,
     LENGTH,
@@ -55,6 +56,8 @@ _ALL_DEGREES = (2.5, 0.5)
 _MOST_STARS = 300
 # A search ends where the next step is expected to gain less, in the logarithm of the posterior.
 _LEAST_GAIN = 1e-5
+# Steps gain less than so many times what they are expected to.
+_SURE = 5.0
 # Most steps of a search, and the longest one of a logarithm.
 _MOST_STEPS = 100
 _LONGEST_STEP = 3.0
@@ -127,18 +130,21 @@ def fit_covariances(
     of_process[:, LENGTH] = length
     linear = np.stack([columns(True, 1, colour) for colour in colour_kinds])
     process_forms = [linear, with_process] if order > 1 else [with_process]
-    presences = [np.concatenate(process_forms)]
-    fits = [posterior.minimize(np.tile(of_process, (len(process_forms), 1)), presences[0], fixed_length=True)]
-    presences.append(np.stack([columns(False, degree, colour) for colour in colour_kinds for degree in smooth_degrees]))
-    fits.append(posterior.minimize(np.tile(start_at(_TREND_START, low_degrees), (len(presences[1]), 1)), presences[1]))
-    present = np.concatenate(presences)
-    optima, form_costs = (np.concatenate(values) for values in zip(*fits, strict=True))
-    coloured = present[:, -1] if colour_count else np.zeros(len(present), dtype=bool)
-    variances = np.array([_variance_count(row[: len(row) - (colour_count > 0)]) for row in present]) + coloured
-    form_costs += _VARIANCE_COST * variances
-    form_costs[~present[:, 0] & ~present[:, PROCESS_COLUMNS]] -= _CONSTANT_BONUS
+    present = np.concatenate(process_forms)
+    optima, values = posterior.minimize(np.tile(of_process, (len(process_forms), 1)), present, fixed_length=True)
+    smooth = np.stack([columns(False, degree, colour) for colour in colour_kinds for degree in smooth_degrees])
+    # A form that is improbable beside these is left out anyway.
+    largest = (values + _prior_costs(present, colour_count)).min() - math.log(0.1 * _LEAST_PROBABILITY)
+    smooth_optima, smooth_values = posterior.minimize(
+        np.tile(start_at(_TREND_START, low_degrees), (len(smooth), 1)),
+        smooth,
+        largest=largest - _prior_costs(smooth, colour_count),
+    )
+    present, optima = np.concatenate([present, smooth]), np.concatenate([optima, smooth_optima])
+    form_costs = np.concatenate([values, smooth_values]) + _prior_costs(present, colour_count)
     probabilities = np.exp(form_costs.min() - form_costs)
     probabilities /= probabilities.sum()
+    coloured = present[:, -1] & (colour_count > 0)
     by_name = np.lexsort([present[:, 0], coloured])  # smooth ones first
     probable = by_name[probabilities[by_name] >= _LEAST_PROBABILITY]
     kernels = posterior.kernels(optima, present)
@@ -148,10 +154,16 @@ def fit_covariances(
     )
 
 
-def _variance_count(present: np.ndarray) -> int:
-    """Return the number of variances that a form pays for: of the process, and of degrees 1 and 2."""
-    process, degree = bool(present[0]), int(present[PROCESS_COLUMNS:].sum())
-    return 1 + min(degree, 1) if process else degree
+def _prior_costs(present: np.ndarray, colour_count: int) -> np.ndarray:
+    """Return minus the logarithms of the prior probability of forms with columns `present` [n_forms, n_columns].
+
+    They pay for the variances that they have: of the process, of degrees 1 and 2, and of colours.
+    """
+    coloured = present[:, -1] & (colour_count > 0)
+    degrees = present[:, PROCESS_COLUMNS : present.shape[1] - (colour_count > 0)].sum(axis=1)
+    count = np.where(present[:, 0], 1 + np.minimum(degrees, 1), degrees) + coloured
+    constant = ~present[:, 0] & (degrees == 0)
+    return np.asarray(_VARIANCE_COST * count - _CONSTANT_BONUS * constant)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,8 +228,7 @@ class Posterior:
             changes = np.empty((len(kernels), 2, *self.distance.shape))  # by the variance and by the length
             decay = np.multiply(kernels[:, 0, None, None], np.exp(-ratio), out=changes[:, 0])
             np.multiply(decay, ratio, out=changes[:, 1])
-            covariance = with_trend_and_noise(decay, kernels, self.terms, self.noise, self.colour_count)
-            inverse, log_determinant = _inverses(covariance)
+            inverse, log_determinant = _inverses(with_trend_and_noise(decay, kernels, self.terms, self.noise, trend))
             inverse_values = inverse @ self.values_and_terms
             precision, square = np.diagonal(inverse, axis1=1, axis2=2), np.einsum("mij,mij->m", inverse, inverse)
             solved, inverse_terms = inverse_values[:, :, :count], inverse_values[:, :, count:]
@@ -237,7 +248,7 @@ class Posterior:
             of_terms = np.einsum("mpak,mak->mpa", self.terms.T @ back, self.terms.T @ solved)
             observed[:, :2] += (trend[:, None] * of_terms) @ self.to_columns
         else:
-            smooth = SmoothCovariance.of(kernels, self.terms, self.noise, self.colour_count)
+            smooth = SmoothCovariance.of(kernels, self.terms, self.noise, trend)
             inverse_values, log_determinant = smooth.solve(self.values_and_terms), smooth.log_determinant
             precision, square = smooth.precision, smooth.square
             solved, inverse_terms = inverse_values[:, :, :count], inverse_values[:, :, count:]
@@ -266,14 +277,13 @@ class Posterior:
         expected *= 0.5 * count
         curvature = observed - expected
         # Of logarithms the second derivative has the first one besides.
-        each = np.arange(kernels.shape[1])
-        curvature[:, each, each] += slope
+        _diagonals(curvature)[:] += slope
         curvature[:, LENGTH, LENGTH] += 0.5 * bend - slope[:, LENGTH]
         curvature[:, 0, LENGTH] += slope[:, LENGTH]
         prior = np.where(present, self.width**-2.0, 0.0)
-        lower = each[:, None] > each
+        lower = np.tri(len(self.middle), k=-1, dtype=bool)
         for matrix in (expected, curvature):
-            matrix[:, each, each] += prior
+            _diagonals(matrix)[:] += prior
             np.copyto(matrix, matrix.transpose(0, 2, 1).copy(), where=lower)
         return SecondOrder(value, slope + away / self.width, curvature, expected)
 
@@ -290,25 +300,32 @@ class Posterior:
         return np.asarray((places[:, None] == np.arange(len(self.middle))) & (columns != 0)[:, None], dtype=float)
 
     def minimize(
-        self, starts: np.ndarray, present: np.ndarray, *, fixed_length: bool = False
+        self,
+        starts: np.ndarray,
+        present: np.ndarray,
+        *,
+        fixed_length: bool = False,
+        largest: np.ndarray | float = np.inf,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the most probable logarithms of forms, [n_forms, n_columns], and the values there, [n_forms].
 
         From starts by Newton's steps, with the expected second derivatives where the surface is no bowl (Fisher's
         scoring), and damped where a step gains nothing (Marquardt 1963); all forms at once. Columns that are not
-        present stay as they were.
+        present stay as they were. The search for a form ends, too, where its value will stay above `largest`.
         """
         low, high = self.middle - _REACH, self.middle + _REACH
         varied = present & ~(fixed_length & (np.arange(present.shape[1]) == LENGTH))
         logarithms = np.where(varied, np.clip(starts, low, high), starts)
         best = self.negative_log_posterior(logarithms, present)
         damping, moving = np.zeros(len(starts)), np.arange(len(starts))
+        most = np.broadcast_to(largest, damping.shape)
         for _ in range(_MOST_STEPS):
             at, here = logarithms[moving], best.of_forms(moving)
             free = varied[moving] & ~((at <= low) & (here.slope > 0.0)) & ~((at >= high) & (here.slope < 0.0))
             step = here.step(free, damping[moving])
             gain = -0.5 * (here.slope * step).sum(axis=1)
             going = (gain > _LEAST_GAIN) & (damping[moving] < _MOST_DAMPING)
+            going &= here.value - _SURE * gain < most[moving]
             moving, at, step = moving[going], at[going], step[going]
             if not len(moving):
                 break
@@ -326,11 +343,15 @@ class Posterior:
 def _inverses(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return inverses of covariances [m, n, n] and logarithms of their determinants [m], infinite where singular."""
     inverses, log_determinants = np.zeros(covariances.shape), np.full(len(covariances), np.inf)
-    lower = np.tri(covariances.shape[1], dtype=bool)
     for i, covariance in enumerate(covariances):
+        # The call of scipy.linalg.cholesky, without what it checks.
         root, failed = scipy.linalg.lapack.dpotrf(covariance, lower=1)
         if not failed:
             log_determinants[i] = 2.0 * np.log(np.diagonal(root)).sum()
-            half = scipy.linalg.lapack.dpotri(root, lower=1)[0]
-            inverses[i] = np.where(lower, half, half.T)
+            inverses[i] = inverse_from_cholesky(root)
     return inverses, log_determinants
+
+
+def _diagonals(matrices: np.ndarray) -> np.ndarray:
+    """Return a view of the diagonals of matrices [m, n, n], [m, n]."""
+    return matrices.reshape(len(matrices), -1)[:, :: matrices.shape[1] + 1]
