@@ -8,8 +8,8 @@ without options, Piff by PixelGrid with pixels of the image's scale and BasisPol
 the sky as weights. At each star that was held out the flux and the centre of either model are fitted to the good pixels
 within 10 pixels, with the noise of sky and star; chi-square a pixel is that of the residual. e and T are those of star
 and model under the same weight. Errors are those of the mean over stars, of each star's mean over the seeds. Times are
-of one thread, of the processor: `fit_own_stars` selects and centres stars, and makes models without a fifth of them
-besides; `PsfModel.fit` makes one model, as Piff does. Ratios are medians over the splits, of fits in turns: to one fit
+of one thread, of the processor: `fit_own_stars` selects and centres stars, and predicts each fifth of them by the
+others besides; `PsfModel.fit` makes one model, as Piff does. Ratios are medians over the splits, of fits in turns: to one fit
 of Piff at the order that is its best by a figure, which nobody knows beforehand, and to its fits at all orders, as our
 model chooses its own.
 """

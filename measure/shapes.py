@@ -110,6 +110,7 @@ def measure_shapes(
     background: ArrayLike = 0.0,
     max_iterations: int = 50,
     tolerance: float = 1e-6,
+    centers: ArrayLike | None = None,
 ) -> Shapes:
     r"""Measure ellipticities from weighted quadrupole moments (Jee & Tyson 2011, eq. 5).
 
@@ -149,6 +150,9 @@ def measure_shapes(
     tolerance : float
         The centroid has converged once a step is shorter than this [pixel]. Steps are Newton's, so the error after
         the last one is far smaller.
+    centers : array, optional
+        Where the steps start, x and y from the centres of the stamps [pixel], [n, 2]; there by default, and for NaN.
+        Near the centroids this saves half of the steps; images with weightless pixels take no notice.
 
     Returns
     -------
@@ -172,6 +176,9 @@ def measure_shapes(
         level = np.broadcast_to(levels, (count,))
     except ValueError as error:
         raise DomainError(f"background has shape {np.shape(background)}: expected one value or {count}") from error
+    starts = np.zeros((count, 2)) if centers is None else np.nan_to_num(pure_numbers(centers, "centers"))
+    if starts.shape != (count, 2):
+        raise DomainError(f"centers have shape {starts.shape}: expected ({count}, 2), x and y of each image")
     weightless = None if weights is None else weightless_pixels(stack, weights)
     batch = max(1, _BATCH_PIXELS // (stack.shape[1] * stack.shape[2]))
     parts = []
@@ -182,7 +189,7 @@ def measure_shapes(
         if bad.any():
             parts.append(_measure_masked(pixels, bad, scale, sigma, max_iterations, tolerance))
         else:
-            parts.append(_measure_batch(pixels, scale, sigma, max_iterations, tolerance))
+            parts.append(_measure_batch(pixels, scale, sigma, max_iterations, tolerance, starts[i : i + batch]))
     if not parts:
         no_values = np.empty(0)
         return Shapes(no_values, no_values, no_values, no_values, no_values, no_values, np.empty(0, dtype=np.int32))
@@ -237,8 +244,18 @@ def half_light_radii(psfs: np.ndarray) -> np.ndarray:
     return np.array([np.interp(0.5, curve, radius) for curve in rising])
 
 
-def _measure_batch(images: np.ndarray, scale: float, sigma: float, max_iterations: int, tolerance: float) -> Shapes:
-    """Measure a batch of background-subtracted float64 images; sigma is the rms width of the weight in pixels."""
+def _measure_batch(
+    images: np.ndarray,
+    scale: float,
+    sigma: float,
+    max_iterations: int,
+    tolerance: float,
+    starts: np.ndarray | None = None,
+) -> Shapes:
+    """Measure a batch of background-subtracted float64 images; sigma is the rms width of the weight in pixels.
+
+    `starts` are where centroids are looked for first, [n, 2].
+    """
     count, ny, nx = images.shape
     half = np.array([(nx - 1) / 2.0, (ny - 1) / 2.0])
     farthest = half - np.minimum(sigma, 0.5 * half)  # nearer to the edge, the weight would be cut
@@ -246,7 +263,7 @@ def _measure_batch(images: np.ndarray, scale: float, sigma: float, max_iteration
     with np.errstate(invalid="ignore"):  # infinities of both signs
         flux = images.reshape(count, -1).sum(axis=1)
     flags[~np.isfinite(flux)] |= ShapeFlag.NO_FLUX
-    center = np.zeros((count, 2))
+    center = np.zeros((count, 2)) if starts is None else starts.copy()
     active = np.flatnonzero(flags == 0)
     for _ in range(max_iterations):
         if not len(active):

@@ -1,4 +1,4 @@
-"""Bad pixels of star stamps: filled from the other stars and the model, and stars of which too little is left."""
+"""Bad pixels of star stamps: filled from the other stars, and stars of which too little is left."""
 
 from __future__ import annotations
 
@@ -117,7 +117,8 @@ class FilledStars:
         filled[masked], lost[masked] = fill_by_profiles(
             images[masked], bad[masked], profiles, x[masked], y[masked], sigma
         )
-        shapes = measure_shapes(filled[masked], pixel_scale, weight_fwhm)
+        near = np.stack([x[masked], y[masked]], axis=1)
+        shapes = measure_shapes(filled[masked], pixel_scale, weight_fwhm, centers=near)
         x[masked], y[masked], usable[masked] = shapes.x, shapes.y, shapes.usable & ~lost[masked]
         return FilledStars(filled, self.median_star, x, y, usable, lost)
 
@@ -163,7 +164,8 @@ def fill_by_median_star(
         if number < _MEDIAN_PASSES:
             star, moving = _median_star(filled[usable], bad[usable], x[usable], y[usable], sigma), masked
         filled[moving], lost[moving] = fill_by_profiles(images[moving], bad[moving], star, x[moving], y[moving], sigma)
-        shapes = measure_shapes(filled[moving], pixel_scale, weight_fwhm)
+        near = np.stack([x[moving], y[moving]], axis=1)
+        shapes = measure_shapes(filled[moving], pixel_scale, weight_fwhm, centers=near)
         step = np.hypot(shapes.x - x[moving], shapes.y - y[moving])
         x[moving], y[moving] = shapes.x, shapes.y
         usable[moving] = shapes.usable & ~lost[moving]

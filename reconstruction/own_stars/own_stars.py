@@ -90,9 +90,9 @@ def fit_own_stars(
         [n, ny, nx], True for pixels to ignore, besides those that hold no light: not finite, or -1e29 or less (-1e30 of
         SExtractor), copies of dead columns (:func:`~pachon.measure.pixel_masks.copied_pixels`), and neighbours and
         cosmic rays of stars. They are left out of the sky, of fluxes and of noise, and filled before a star is
-        centred: by the median star, then by the model at the star's place. A star is lost only where they hold
-        more than half of its light above half of its peak, or under the weight of the moments: with the flag of its
-        neighbour or cosmic ray, else ``MASKED``.
+        centred: by the median star, then by what the other stars predict at its place. A star is lost only where they
+        hold more than half of its light above half of its peak, or under the weight of the moments: with the flag of
+        its neighbour or cosmic ray, else ``MASKED``.
     seed : int
         Of the parts that are held out.
     **options
