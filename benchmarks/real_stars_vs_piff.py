@@ -9,9 +9,9 @@ the sky as weights. At each star that was held out the flux and the centre of ei
 within 10 pixels, with the noise of sky and star; chi-square a pixel is that of the residual. e and T are those of star
 and model under the same weight. Errors are those of the mean over stars, of each star's mean over the seeds. Times are
 of one thread, of the processor: `fit_own_stars` selects and centres stars, and predicts each fifth of them by the
-others besides; `PsfModel.fit` makes one model, as Piff does. Ratios are medians over the splits, of fits in turns: to one fit
-of Piff at the order that is its best by a figure, which nobody knows beforehand, and to its fits at all orders, as our
-model chooses its own.
+others besides; `PsfModel.fit` makes one model, as Piff does. Ratios are medians over the splits, of fits in turns: to
+one fit of Piff at the order that is its best by a figure, which nobody knows beforehand, and to its fits at all orders,
+as our model chooses its own.
 """
 
 import argparse
