@@ -139,7 +139,8 @@ def center_stamps(
     placed = np.flatnonzero(np.isfinite(offsets).all(axis=1))
     for first in range(0, len(placed), _SHIFTED_TOGETHER):
         indices = placed[first : first + _SHIFTED_TOGETHER]
-        shifted = fourier_shifts(stack[indices], *(middle - offsets[indices]).T, rows, columns)
+        dx, dy = (middle - offsets[indices]).T
+        shifted = fourier_shifts(stack[indices], dx, dy, rows, columns)
         if normalize:
             total = shifted.reshape(len(indices), -1).sum(axis=1)
             shifted /= np.where(total > 0.0, total, np.nan)[:, None, None]

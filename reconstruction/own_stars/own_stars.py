@@ -306,7 +306,7 @@ def _flux_and_snr(stamps: np.ndarray, rms: np.ndarray, gain: float) -> tuple[np.
     total = stamps.sum(axis=(1, 2))
     bright = total > 0.0
     if not bright.any():
-        return np.full((2, len(stamps)), np.nan)
+        return np.full(len(stamps), np.nan), np.full(len(stamps), np.nan)
     psf = column_median(sorted_columns((stamps[bright] / total[bright, None, None]).reshape(bright.sum(), -1)))
     psf /= psf.sum()
     squares = (psf**2).sum()
