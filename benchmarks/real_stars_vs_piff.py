@@ -8,10 +8,10 @@ without options, Piff by PixelGrid with pixels of the image's scale and BasisPol
 the sky as weights. At each star that was held out the flux and the centre of either model are fitted to the good pixels
 within 10 pixels, with the noise of sky and star; chi-square a pixel is that of the residual. e and T are those of star
 and model under the same weight. Errors are those of the mean over stars, of each star's mean over the seeds. Times are
-of one thread, of the processor: `fit_own_stars` selects and centres stars, and makes models without a fifth of them
-besides; `PsfModel.fit` makes one model, as Piff does. Ratios are medians over the splits, of fits in turns: to one fit
-of Piff at the order that is its best by a figure, which nobody knows beforehand, and to its fits at all orders, as our
-model chooses its own.
+of one thread, of the processor: `fit_own_stars` selects and centres stars, and predicts each fifth of them by the
+others besides; `PsfModel.fit` makes one model, as Piff does. Ratios are medians over the splits, of fits in turns: to
+one fit of Piff at the order that is its best by a figure, which nobody knows beforehand, and to its fits at all orders,
+as our model chooses its own.
 """
 
 import argparse
@@ -48,10 +48,9 @@ class Stars:
         level, rms = sky_of_stamps(stamps, bad, 0.4 * self.side)
         images = np.where(bad, 0.0, stamps - level[:, None, None])
         self.weight_fwhm = float(np.median(fwhm(images, scale)))
-        filled, _, _ = fill_by_median_star(images, bad, scale, self.weight_fwhm)
-        first = pachon.measure_shapes(filled, scale, self.weight_fwhm)
+        first = fill_by_median_star(images, bad, scale, self.weight_fwhm)
         size = self.side - 4 - (self.side + 1) % 2
-        centred = pachon.measure.center_stamps(filled, first.x, first.y, size, normalize=False)
+        centred = pachon.measure.center_stamps(first.images, first.x, first.y, size, normalize=False)
         selection = pachon.measure.flag_stars(centred, rms, gain=gain)
         bad |= decenter_masks(selection.masks, first.x, first.y, images.shape[1:])
         level, self.rms = sky_of_stamps(stamps, bad, 0.4 * self.side)

@@ -121,6 +121,15 @@ def fill_symmetric(images: np.ndarray, bad: np.ndarray, x: Any = 0.0, y: Any = 0
     count, ny, nx = images.shape
     centers = np.stack([np.broadcast_to(np.nan_to_num(center), (count,)) for center in (y, x)], axis=1)
     masked = np.flatnonzero(bad.any(axis=(1, 2)))
+    if not centers.any():
+        turned, turned_bad = filled[masked][:, ::-1, ::-1], bad[masked][:, ::-1, ::-1]
+        filled[masked] = np.where(bad[masked], turned, filled[masked])
+        unpaired = bad[masked] & turned_bad
+        alone = unpaired.any(axis=(1, 2))
+        masked, unpaired = masked[alone], unpaired[alone]
+        near_good = _near_means(np.where(bad[masked], 0.0, images[masked]), bad[masked])
+        filled[masked] = np.where(unpaired, near_good, filled[masked])
+        return filled
     for i, near_good in zip(masked, _near_means(filled[masked], bad[masked]), strict=True):
         rows, columns = np.nonzero(bad[i])
         opposite = np.stack([ny - 1 + 2.0 * centers[i, 0] - rows, nx - 1 + 2.0 * centers[i, 1] - columns])

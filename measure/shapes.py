@@ -32,6 +32,10 @@ if TYPE_CHECKING:
 _WIDEST = 0.999
 #: Most images of one call: more would take days.
 _MOST_IMAGES = 10**8
+# Rows and columns on which the spans of bright pixels begin and end.
+_SPAN_STEP = 2
+# Pixels of the finer grid that are worked on at once, as fit the cache.
+_FINE_PIXELS = 1 << 17
 _BATCH_PIXELS = 1 << 20  # 8 MB a work array: the memory used does not grow with the number of stars
 
 
@@ -106,6 +110,7 @@ def measure_shapes(
     background: ArrayLike = 0.0,
     max_iterations: int = 50,
     tolerance: float = 1e-6,
+    centers: ArrayLike | None = None,
 ) -> Shapes:
     r"""Measure ellipticities from weighted quadrupole moments (Jee & Tyson 2011, eq. 5).
 
@@ -145,6 +150,9 @@ def measure_shapes(
     tolerance : float
         The centroid has converged once a step is shorter than this [pixel]. Steps are Newton's, so the error after
         the last one is far smaller.
+    centers : array, optional
+        Where the steps start, x and y from the centres of the stamps [pixel], [n, 2]; there by default, and for NaN.
+        Near the centroids this saves half of the steps; images with weightless pixels take no notice.
 
     Returns
     -------
@@ -168,6 +176,9 @@ def measure_shapes(
         level = np.broadcast_to(levels, (count,))
     except ValueError as error:
         raise DomainError(f"background has shape {np.shape(background)}: expected one value or {count}") from error
+    starts = np.zeros((count, 2)) if centers is None else np.nan_to_num(pure_numbers(centers, "centers"))
+    if starts.shape != (count, 2):
+        raise DomainError(f"centers have shape {starts.shape}: expected ({count}, 2), x and y of each image")
     weightless = None if weights is None else weightless_pixels(stack, weights)
     batch = max(1, _BATCH_PIXELS // (stack.shape[1] * stack.shape[2]))
     parts = []
@@ -178,7 +189,7 @@ def measure_shapes(
         if bad.any():
             parts.append(_measure_masked(pixels, bad, scale, sigma, max_iterations, tolerance))
         else:
-            parts.append(_measure_batch(pixels, scale, sigma, max_iterations, tolerance))
+            parts.append(_measure_batch(pixels, scale, sigma, max_iterations, tolerance, starts[i : i + batch]))
     if not parts:
         no_values = np.empty(0)
         return Shapes(no_values, no_values, no_values, no_values, no_values, no_values, np.empty(0, dtype=np.int32))
@@ -205,15 +216,19 @@ def fwhm(images: ArrayLike, pixel_scale: ArrayLike, *, upsampling: int = 8) -> n
     if upsampling < 2:
         raise DomainError(f"upsampling = {upsampling}: expected at least 2")
     result = np.full(len(stack), np.nan)
+    measured = np.flatnonzero(np.isfinite(stack).all(axis=(1, 2)))
+    spans = _bright_spans(stack, measured)
     with one_blas_thread():
-        for i, image in enumerate(stack):
-            image = np.asarray(image, dtype=np.float64)
-            if not np.all(np.isfinite(image)):
-                continue
-            fine = _upsampled_core(image, upsampling)
-            peak = _interpolated_peak(fine)
-            if peak > 0.0:
-                result[i] = 2.0 * np.sqrt(_area_above(fine, 0.5 * peak) / np.pi) / upsampling * scale
+        for span in np.unique(spans, axis=0):
+            of_span = measured[(spans == span).all(axis=1)]
+            batch = max(1, _FINE_PIXELS // (upsampling**2 * int(np.prod(span[1::2] - span[::2]))))
+            for i in range(0, len(of_span), batch):
+                indices = of_span[i : i + batch]
+                fine = _upsampled(stack[indices].astype(np.float64), span, upsampling)
+                peak = _interpolated_peaks(fine)
+                area = _areas_above(fine, 0.5 * peak)
+                width = 2.0 * np.sqrt(area / np.pi) / upsampling * scale
+                result[indices] = np.where(peak > 0.0, width, np.nan)
     return result
 
 
@@ -229,8 +244,18 @@ def half_light_radii(psfs: np.ndarray) -> np.ndarray:
     return np.array([np.interp(0.5, curve, radius) for curve in rising])
 
 
-def _measure_batch(images: np.ndarray, scale: float, sigma: float, max_iterations: int, tolerance: float) -> Shapes:
-    """Measure a batch of background-subtracted float64 images; sigma is the rms width of the weight in pixels."""
+def _measure_batch(
+    images: np.ndarray,
+    scale: float,
+    sigma: float,
+    max_iterations: int,
+    tolerance: float,
+    starts: np.ndarray | None = None,
+) -> Shapes:
+    """Measure a batch of background-subtracted float64 images; sigma is the rms width of the weight in pixels.
+
+    `starts` are where centroids are looked for first, [n, 2].
+    """
     count, ny, nx = images.shape
     half = np.array([(nx - 1) / 2.0, (ny - 1) / 2.0])
     farthest = half - np.minimum(sigma, 0.5 * half)  # nearer to the edge, the weight would be cut
@@ -238,12 +263,13 @@ def _measure_batch(images: np.ndarray, scale: float, sigma: float, max_iteration
     with np.errstate(invalid="ignore"):  # infinities of both signs
         flux = images.reshape(count, -1).sum(axis=1)
     flags[~np.isfinite(flux)] |= ShapeFlag.NO_FLUX
-    center = np.zeros((count, 2))
+    center = np.zeros((count, 2)) if starts is None else starts.copy()
     active = np.flatnonzero(flags == 0)
     for _ in range(max_iterations):
         if not len(active):
             break
-        total, first, second = _weighted_moments(images[active], center[active], sigma)
+        pixels = images if len(active) == count else images[active]
+        total, first, second = _weighted_moments(pixels, center[active], sigma)
         dark = ~(total > 0.0)
         flags[active[dark]] |= ShapeFlag.NO_FLUX
         active, first, second = active[~dark], first[~dark], second[~dark]
@@ -257,14 +283,15 @@ def _measure_batch(images: np.ndarray, scale: float, sigma: float, max_iteration
     center[flags != 0] = np.nan
     measured = np.flatnonzero(flags == 0)
     # Once more about the final centre: the moments of the last pass belong to the centre before its step.
-    _, first, second = _weighted_moments(images[measured], center[measured], sigma)
+    pixels = images if len(measured) == count else images[measured]
+    _, first, second = _weighted_moments(pixels, center[measured], sigma)
     q11 = second[:, 0] - first[:, 0] ** 2
     q22 = second[:, 1] - first[:, 1] ** 2
     q12 = second[:, 2] - first[:, 0] * first[:, 1]
     determinant = q11 * q22 - q12**2
     good = (determinant > 0.0) & (q11 > 0.0)
     flags[measured[~good]] |= ShapeFlag.NEGATIVE_MOMENTS
-    endless = (determinant > _WIDEST**4 * sigma**4) | _rises_to_an_edge(images[measured], center[measured], sigma)
+    endless = (determinant > _WIDEST**4 * sigma**4) | _rises_to_an_edge(pixels, center[measured], sigma)
     flags[measured[endless & good]] |= ShapeFlag.NO_SOURCE
     good &= ~endless
     e1, e2, size = (np.full(count, np.nan) for _ in range(3))
@@ -316,19 +343,16 @@ def _weighted_moments(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the sum [n], mean (x, y) [n, 2] and (xx, yy, xy) [n, 3] of weight times image about `center`.
 
-    Plain sums along the last axis and no matrix products: these add in an order that no batch size and no BLAS changes.
+    Sums row by row and no matrix products: these add in an order that no batch size and no BLAS changes.
     """
     _, ny, nx = images.shape
     x = np.arange(nx) - (nx - 1) / 2.0 - center[:, :1]
     y = np.arange(ny) - (ny - 1) / 2.0 - center[:, 1:]
     weight_x = np.exp(-0.5 * (x / sigma) ** 2)
     weight_y = np.exp(-0.5 * (y / sigma) ** 2)
-    product = images * weight_x[:, None, :]
-    row0 = product.sum(axis=2) * weight_y
-    product *= x[:, None, :]
-    row1 = product.sum(axis=2) * weight_y
-    product *= x[:, None, :]
-    row2 = product.sum(axis=2) * weight_y
+    row0, row1, row2 = (
+        np.einsum("nyx,nx->ny", images, factor) * weight_y for factor in (weight_x, weight_x * x, weight_x * x**2)
+    )
     total = row0.sum(axis=1)
     sums = np.stack(
         [row1.sum(axis=1), (row0 * y).sum(axis=1), row2.sum(axis=1), (row0 * y**2).sum(axis=1), (row1 * y).sum(axis=1)],
@@ -378,54 +402,73 @@ def _sinc_matrix(count: int, factor: int) -> np.ndarray:
     return np.where(on_pixel, 1.0, np.sin(count * turn) / (count * np.where(on_pixel, 1.0, below)))
 
 
-def _upsampled_core(image: np.ndarray, factor: int) -> np.ndarray:
-    """Return the band-limited image on a grid `factor` times finer, about the pixels above a quarter of the maximum."""
-    bright = image > 0.25 * image.max()
-    if not bright.any():  # all pixels are negative
-        return image
-    to_fine = []
-    for count, lit in zip(image.shape, (bright.any(axis=1), bright.any(axis=0)), strict=True):
-        first, *_, last = np.flatnonzero(lit)[[0, -1]]
-        span = slice(max(first - 2, 0) * factor, min(last + 3, count) * factor)
-        to_fine.append(_sinc_matrix(count, factor)[span])
-    return to_fine[0] @ image @ to_fine[1].T
+def _bright_spans(images: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Return first and end row, first and end column about the pixels above a quarter of the maximum, [n_chosen, 4].
+
+    They begin and end on multiples of :data:`_SPAN_STEP`, or at the edges, so that many images have the same.
+    """
+    bounds = []
+    bright = images[chosen] > 0.25 * images[chosen].max(axis=(1, 2), keepdims=True)
+    bright |= ~bright.any(axis=(1, 2), keepdims=True)  # all pixels are negative
+    for axis in (2, 1):
+        lit, count = bright.any(axis=axis), images.shape[3 - axis]
+        first, last = lit.argmax(axis=1), count - 1 - lit[:, ::-1].argmax(axis=1)
+        bounds.append(np.maximum((first - 2) // _SPAN_STEP * _SPAN_STEP, 0))
+        bounds.append(np.minimum(-(-(last + 3) // _SPAN_STEP) * _SPAN_STEP, count))
+    return np.stack(bounds, axis=1)
 
 
-def _interpolated_peak(fine: np.ndarray) -> float:
-    """Return the maximum of the paraboloid through the highest pixel and its neighbours."""
-    j, i = np.unravel_index(np.argmax(fine), fine.shape)
-    ny, nx = fine.shape
-    value = fine[j, i]
-    peak = value
-    for before, after in ((fine[j, i - 1], fine[j, (i + 1) % nx]), (fine[j - 1, i], fine[(j + 1) % ny, i])):
+def _upsampled(images: np.ndarray, span: np.ndarray, factor: int) -> np.ndarray:
+    """Return the band-limited images [n, ny, nx] on a grid `factor` times finer, on a span of rows and columns."""
+    rows, columns = (slice(first * factor, end * factor) for first, end in span.reshape(2, 2).tolist())
+    ny, nx = images.shape[1:]
+    return np.asarray(_sinc_matrix(ny, factor)[rows] @ images @ _sinc_matrix(nx, factor)[columns].T)
+
+
+def _interpolated_peaks(fine: np.ndarray) -> np.ndarray:
+    """Return the maxima [n] of the paraboloids through the highest pixel of images and its neighbours."""
+    n, ny, nx = fine.shape
+    each = np.arange(n)
+    j, i = np.divmod(fine.reshape(n, -1).argmax(axis=1), nx)
+    value = fine[each, j, i]
+    peak = value.copy()
+    for before, after in (
+        (fine[each, j, i - 1], fine[each, j, (i + 1) % nx]),
+        (fine[each, j - 1, i], fine[each, (j + 1) % ny, i]),
+    ):
         curvature = before + after - 2.0 * value
-        if curvature < 0.0:
-            peak -= (after - before) ** 2 / (8.0 * curvature)
-    return float(peak)
+        curved = curvature < 0.0
+        peak -= np.where(curved, (after - before) ** 2 / (8.0 * np.where(curved, curvature, 1.0)), 0.0)
+    return peak
 
 
-def _area_above(fine: np.ndarray, level: float) -> float:
-    """Return the area above a level [fine pixel^2], border pixels counted in part as if the image were plane there."""
-    inside = fine > level
+def _areas_above(fine: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """Return the areas of images above levels [n], in pixels; border pixels count in part, as if planes there."""
+    height = fine - levels[:, None, None]
+    inside = height > 0.0
     # No slope is steeper than the largest differences: most pixels are neither border nor in need of a gradient.
-    steepest = [float(np.abs(np.diff(fine, axis=axis)).max()) for axis in (0, 1)]
-    rows, columns = np.nonzero(np.abs(fine - level) <= 0.5 * np.hypot(steepest[0], steepest[1]))
-    gy = _difference_along(fine, rows, columns, 0)
-    gx = _difference_along(fine, rows, columns, 1)
-    slope, height = np.hypot(gx, gy), fine[rows, columns] - level
-    border = np.abs(height) < 0.5 * slope
-    covered = inside.astype(np.float64)
-    covered[rows[border], columns[border]] = 0.5 + height[border] / slope[border]
-    return float(covered.sum())
+    steepest = [np.abs(np.diff(fine, axis=axis)).max(axis=(1, 2)) for axis in (1, 2)]
+    near = np.abs(height) <= 0.5 * np.hypot(*steepest)[:, None, None]
+    n, ny, nx = fine.shape
+    places = np.flatnonzero(near)
+    image, row, column = places // (ny * nx), places // nx % ny, places % nx
+    gy = _difference_along(fine, places, row, nx)
+    gx = _difference_along(fine, places, column, 1)
+    slope, height_there = np.hypot(gx, gy), height.ravel()[places]
+    border = np.abs(height_there) < 0.5 * slope
+    covered = 0.5 + height_there[border] / slope[border] - inside.ravel()[places[border]]
+    return np.asarray(inside.sum(axis=(1, 2)) + np.bincount(image[border], covered, n))
 
 
-def _difference_along(fine: np.ndarray, rows: np.ndarray, columns: np.ndarray, axis: int) -> np.ndarray:
-    """Return the derivative of an image along an axis at some pixels, as :func:`numpy.gradient` has it."""
-    last = fine.shape[axis] - 1
-    place = (rows, columns)[axis]
-    low, high = np.maximum(place - 1, 0), np.minimum(place + 1, last)
-    before, after = (fine[low, columns], fine[high, columns]) if axis == 0 else (fine[rows, low], fine[rows, high])
-    return np.asarray((after - before) / (high - low))
+def _difference_along(fine: np.ndarray, places: np.ndarray, along: np.ndarray, step: int) -> np.ndarray:
+    """Return the derivative of images along an axis at flat places, as :func:`numpy.gradient` has it.
+
+    `along` are their indices on that axis, and `step` is the distance of neighbours along it.
+    """
+    last = fine.shape[1 if step > 1 else 2] - 1
+    low, high = np.where(along > 0, 1, 0), np.where(along < last, 1, 0)
+    values = fine.ravel()
+    return np.asarray((values[places + step * high] - values[places - step * low]) / (low + high))
 
 
 def stamp_cube(images: ArrayLike) -> np.ndarray:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft, ndimage
+from scipy import fft
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
+from ..core.threads import one_blas_thread
 from ..core.units import pure_numbers, real_array
 from .pixel_masks import fill_symmetric, weightless_pixels
 
@@ -138,12 +139,12 @@ def center_stamps(
     placed = np.flatnonzero(np.isfinite(offsets).all(axis=1))
     for first in range(0, len(placed), _SHIFTED_TOGETHER):
         indices = placed[first : first + _SHIFTED_TOGETHER]
-        shifted = fourier_shifts(stack[indices], *(middle - offsets[indices]).T)
-        for i, image in zip(indices, shifted, strict=True):
-            stamp = image[rows, columns]
-            total = stamp.sum() if normalize else 1.0
-            if total > 0.0:
-                result[i] = stamp / total
+        dx, dy = (middle - offsets[indices]).T
+        shifted = fourier_shifts(stack[indices], dx, dy, rows, columns)
+        if normalize:
+            total = shifted.reshape(len(indices), -1).sum(axis=1)
+            shifted /= np.where(total > 0.0, total, np.nan)[:, None, None]
+        result[indices] = shifted
     if masked.any():
         result[masked] = np.where(
             center_masks(bad[masked], offsets[masked, 0], offsets[masked, 1], size), np.nan, result[masked]
@@ -159,10 +160,7 @@ def center_masks(masks: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> 
     ny, nx = masks.shape[1:]
     rows, columns = _middle_pixels(size, (ny, nx))
     shifts = np.array([nx // 2 - (nx - 1) / 2.0, ny // 2 - (ny - 1) / 2.0]) - np.nan_to_num(np.stack([x, y], axis=1))
-    result = np.zeros((len(masks), size, size), dtype=bool)
-    for i in np.flatnonzero(masks.any(axis=(1, 2))):
-        result[i] = shift_mask(masks[i], *shifts[i])[rows, columns]
-    return result
+    return shift_masks(masks, *shifts.T)[:, rows, columns]
 
 
 def decenter_masks(masks: np.ndarray, x: np.ndarray, y: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
@@ -173,18 +171,37 @@ def decenter_masks(masks: np.ndarray, x: np.ndarray, y: np.ndarray, shape: tuple
     rows, columns = _middle_pixels(masks.shape[1], shape)
     shifts = np.nan_to_num(np.stack([x, y], axis=1)) - np.array([n // 2 - (n - 1) / 2.0 for n in shape[::-1]])
     result = np.zeros((len(masks), *shape), dtype=bool)
-    for i in np.flatnonzero(masks.any(axis=(1, 2))):
-        result[i, rows, columns] = masks[i]
-        result[i] = shift_mask(result[i], *shifts[i])
-    return result
+    result[:, rows, columns] = masks
+    return shift_masks(result, *shifts.T)
 
 
-def shift_mask(mask: np.ndarray, dx: float, dy: float) -> np.ndarray:
-    """Return the pixels of an image moved by (dx, dy) that masked ones overlap by a tenth of a pixel or more."""
-    if not mask.any():
-        return mask
-    overlap = ndimage.shift(mask.astype(np.float64), (dy, dx), order=1, mode="constant")
-    return np.asarray(overlap > _OVERLAP)
+def shift_masks(masks: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+    """Return the pixels that masks [n, ny, nx] overlap by a tenth of a pixel or more, moved by dx and dy [n].
+
+    Pixels into which a part of the outside moves are not masked.
+    """
+    pixels = np.flatnonzero(masks)
+    star, place = np.divmod(pixels, masks[0].size)
+    row, column = np.divmod(place, masks.shape[2])
+    (rows, row_parts), (columns, column_parts) = (
+        _overlaps(pixel, shift[star], count)
+        for pixel, shift, count in zip((row, column), (dy, dx), masks.shape[1:], strict=True)
+    )
+    overlapped = ((star * masks.shape[1] + rows[:, None]) * masks.shape[2] + columns).ravel()
+    overlap = np.bincount(overlapped, (row_parts[:, None] * column_parts).ravel(), masks.size)
+    return np.asarray(overlap > _OVERLAP).reshape(masks.shape)
+
+
+def _overlaps(pixels: np.ndarray, shifts: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the two pixels of a line of `count` that each of pixels [n] overlaps, moved by shifts [n], and how far.
+
+    Both are [2, n]. Pixels beyond the line are its first with a part of zero.
+    """
+    low = np.floor(pixels + shifts).astype(int)
+    part = pixels + shifts - low
+    places = np.stack([low, low + 1])
+    inside = (places - shifts >= 0.0) & (places - shifts <= count - 1) & (places >= 0) & (places < count)
+    return places * inside, np.stack([1.0 - part, part]) * inside
 
 
 def _middle_pixels(size: int, shape: tuple[int, int]) -> tuple[slice, slice]:
@@ -211,16 +228,44 @@ def fourier_shift(image: np.ndarray, dx: float, dy: float) -> np.ndarray:
     return fft.irfft2(fft.rfft2(image) * phase_y[:, None] * phase_x, s=(ny, nx))
 
 
-def fourier_shifts(images: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
-    """Return images [n, ny, nx] each moved as by :func:`fourier_shift`, dx and dy [n], all at once."""
-    ny, nx = images.shape[1:]
-    phase_x = np.exp(-2j * np.pi * fft.rfftfreq(nx) * dx[:, None])
-    phase_y = np.exp(-2j * np.pi * fft.fftfreq(ny) * dy[:, None])
-    if nx % 2 == 0:
-        phase_x[:, -1] = np.cos(np.pi * dx)
-    if ny % 2 == 0:
-        phase_y[:, ny // 2] = np.cos(np.pi * dy)
-    return fft.irfft2(fft.rfft2(images) * phase_y[:, :, None] * phase_x[:, None], s=(ny, nx))
+def fourier_shifts(
+    images: np.ndarray,
+    dx: np.ndarray,
+    dy: np.ndarray,
+    rows: slice = slice(None),
+    columns: slice = slice(None),
+) -> np.ndarray:
+    """Return rows and columns of images each moved as by :func:`fourier_shift`, dx and dy [n].
+
+    `images` are [n, ny, nx], or one [ny, nx] that is moved to n places. The sums with periodic sincs along both axes
+    are a fraction of the work of a transform of a small image.
+    """
+    along_y, along_x = (
+        _shift_matrices(count, shift, lines)
+        for count, shift, lines in zip(images.shape[-2:], (dy, dx), (rows, columns), strict=True)
+    )
+    with one_blas_thread():
+        return np.asarray(along_y @ images @ along_x.transpose(0, 2, 1))
+
+
+def _shift_matrices(count: int, shifts: np.ndarray, lines: slice) -> np.ndarray:
+    """Return matrices that move a line of pixels by each of shifts [n], with the rows of some lines of the result.
+
+    [n, n_lines, count]. The highest frequency of an even number of pixels stands for both its signs.
+    """
+    whole = np.rint(shifts)[:, None]
+    part = shifts[:, None] - whole
+    # The pixel at `to` gets that at `of` times the periodic sinc of to - of less the shift.
+    steps = np.arange(1 - count, count) - whole
+    steps -= count * np.rint(steps / count)
+    turn = np.pi * (steps - part) / count
+    sign = 2.0 * (steps % 2) - 1.0
+    sine = np.sin(turn)
+    on_pixel = np.abs(sine) < 1e-12
+    below = np.where(on_pixel, 1.0, sine if count % 2 else np.tan(turn))
+    sinc = np.where(on_pixel, 1.0, sign * np.sin(np.pi * part) / (count * below))
+    to_of = np.lib.stride_tricks.sliding_window_view(sinc[:, ::-1], count, axis=1)[:, ::-1]
+    return np.ascontiguousarray(to_of[:, lines])
 
 
 def _stamp_cube(images: ArrayLike, name: str) -> np.ndarray:

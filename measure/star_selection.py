@@ -174,27 +174,30 @@ def flag_stars(
     variances = photon_variances + (scales[usable, None, None] * allowance) ** 2
     sharp_pixels = _sharp_pixels(residuals, variances, fraction, threshold)
     matched_filter = MatchedFilter.of(star)
-    for i, residual, photons, variance, struck in zip(
-        usable_indices, residuals, photon_variances, variances, sharp_pixels, strict=True
-    ):
-        flux = scales[i]
-        if saturation is not None:
-            masks[i] = images[i] >= saturation
-        unsure = np.hypot(
-            np.sqrt(photons[core].sum()) / (flux * star[core].sum()), _scale_error(photons, star, wings) / flux
+    fluxes = scales[usable]
+    core_error = np.sqrt(photon_variances[:, core].sum(axis=1)) / (fluxes * star[core].sum())
+    unsure = np.hypot(core_error, _scale_errors(photon_variances[:, wings], star[wings]) / fluxes)
+    saturated = lack[usable] > np.maximum(_LOSS, threshold * unsure)
+    if saturation is not None:
+        masks[usable] = images[usable] >= saturation
+        saturated |= masks[usable].any(axis=(1, 2))
+    flags[usable_indices[saturated]] |= StarFlag.SATURATED
+    masks[usable_indices[saturated]] |= core
+    # Whatever else the residual of a saturated star shows is the lost core.
+    compared = np.flatnonzero(~saturated)
+    hit = sharp_pixels[compared].any(axis=(1, 2))
+    flags[usable_indices[compared[hit]]] |= StarFlag.COSMIC_RAY
+    masks[usable_indices[compared]] = sharp_pixels[compared]
+    residuals = np.where(sharp_pixels, 0.0, residuals)
+    light, squares = matched_filter.light(residuals[compared]), matched_filter.squares(variances[compared])
+    significant = (light / np.sqrt(squares)).max(axis=(1, 2), initial=0.0) > threshold
+    for place, of_variance in zip(compared[significant], squares[significant], strict=True):
+        neighbours = _neighbour_pixels(
+            residuals[place], variances[place], of_variance, photon_variances[place], matched_filter, threshold
         )
-        if masks[i].any() or lack[i] > max(_LOSS, threshold * unsure):
-            flags[i] |= StarFlag.SATURATED
-            masks[i] |= core
-            continue  # whatever else its residual shows is the lost core
-        if struck.any():
-            flags[i] |= StarFlag.COSMIC_RAY
-            masks[i] = struck
-            residual = np.where(struck, 0.0, residual)
-        neighbours = _neighbour_pixels(residual, variance, photons, matched_filter, threshold)
         if neighbours is not None:
-            flags[i] |= StarFlag.NEIGHBOUR
-            masks[i] |= neighbours
+            flags[usable_indices[place]] |= StarFlag.NEIGHBOUR
+            masks[usable_indices[place]] |= neighbours
     return Selection(flags, masks)
 
 
@@ -208,9 +211,12 @@ def _median_star(images: np.ndarray) -> np.ndarray:
     return star / star.sum()
 
 
-def _scale_error(variance: np.ndarray, star: np.ndarray, wings: np.ndarray) -> float:
-    """Return the error of the median of pixel over star in the wings: that of the mean times sqrt(pi/2)."""
-    return float(np.sqrt(0.5 * np.pi * (variance[wings] / star[wings] ** 2).mean() / wings.sum()))
+def _scale_errors(variances: np.ndarray, star: np.ndarray) -> np.ndarray:
+    """Return the errors [n] of medians of pixel over star [n_wings] in the wings: those of means times sqrt(pi/2).
+
+    `variances` of the pixels are [n, n_wings].
+    """
+    return np.sqrt(0.5 * np.pi * (variances / star**2).mean(axis=1) / len(star))
 
 
 def _sharp_pixels(residuals: np.ndarray, variances: np.ndarray, fraction: float, threshold: float) -> np.ndarray:
@@ -259,29 +265,34 @@ class MatchedFilter:
         filter_without_norm = cls(star, peak, padded, (star_transform, square_transform), np.zeros(star.shape))
         return replace(filter_without_norm, norm=filter_without_norm.squares(np.ones(star.shape)))
 
-    def light(self, image: np.ndarray) -> np.ndarray:
-        """Return the sums with the star."""
-        return self._correlate(image, self.transforms[0])
+    def light(self, images: np.ndarray) -> np.ndarray:
+        """Return the sums with the star, of images [..., ny, nx]."""
+        return self._correlate(images, self.transforms[0])
 
-    def squares(self, image: np.ndarray) -> np.ndarray:
-        """Return the sums with the square of the star."""
-        return self._correlate(image, self.transforms[1])
+    def squares(self, images: np.ndarray) -> np.ndarray:
+        """Return the sums with the square of the star, of images [..., ny, nx]."""
+        return self._correlate(images, self.transforms[1])
 
-    def _correlate(self, image: np.ndarray, transform: np.ndarray) -> np.ndarray:
-        product = fft.irfft2(fft.rfft2(image, self.padded) * transform, self.padded)
-        rows, columns = (slice(n - 1 - at, 2 * n - 1 - at) for n, at in zip(image.shape, self.peak, strict=True))
-        return np.asarray(product[rows, columns])
+    def _correlate(self, images: np.ndarray, transform: np.ndarray) -> np.ndarray:
+        product = fft.irfft2(fft.rfft2(images, self.padded) * transform, self.padded)
+        rows, columns = (slice(n - 1 - at, 2 * n - 1 - at) for n, at in zip(self.star.shape, self.peak, strict=True))
+        return np.asarray(product[..., rows, columns])
 
 
 def _neighbour_pixels(
-    residual: np.ndarray, variance: np.ndarray, photons: np.ndarray, matched_filter: MatchedFilter, threshold: float
+    residual: np.ndarray,
+    variance: np.ndarray,
+    squares: np.ndarray,
+    photons: np.ndarray,
+    matched_filter: MatchedFilter,
+    threshold: float,
 ) -> np.ndarray | None:
     """Return the pixels of neighbours [ny, nx] bool, one after the other by significance; None without any.
 
-    `variance` has the allowance for the PSF's variation in it, `photons` noise alone.
+    `variance` has the allowance for the PSF's variation in it, `photons` noise alone; `squares` are its sums with the
+    square of the star.
     """
     star, peak, norm = matched_filter.star, matched_filter.peak, matched_filter.norm
-    squares = matched_filter.squares(variance)
     rms, neighbours = np.sqrt(photons), np.zeros(star.shape, dtype=bool)
     remaining, scaled_again = residual, False
     for _ in range(_MOST_NEIGHBOURS):

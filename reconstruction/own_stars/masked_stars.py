@@ -1,26 +1,40 @@
-"""Bad pixels of star stamps: filled from the other stars and the model, and stars of which too little is left."""
+"""Bad pixels of star stamps: filled from the other stars, and stars of which too little is left."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ...core.errors import DomainError
 from ...core.statistics import RMS_PER_MAD, finite_row_medians, masked_median, robust_rms
+from ...core.threads import one_blas_thread
 from ...measure.masked_moments import MOST_MASKED
 from ...measure.pixel_masks import bad_pixels, copied_pixels, fill_symmetric
 from ...measure.shapes import Shapes, measure_shapes
-from ...measure.stamps import fourier_shifts, shift_mask
+from ...measure.stamps import fourier_shifts, shift_masks
+from ..psf_model.checks import as_extent
+from ..psf_model.pixel_fields import Contrasts, SignalCovariance
+from ..psf_model.polynomial import design_matrix, mapped
 
 # Passes end when no centroid moves by more than this [pixel], a tenth of the error of a star of S/N 200.
 _CONVERGED = 1e-3
 # Most passes.
 _MOST_PASSES = 10
 # Passes with a new median star: later ones change it by less than its noise.
-_MEDIAN_PASSES = 3
+_MEDIAN_PASSES = 2
 # Pixels beyond the stamp of the PSF on each side that shifts may bring in from the other side, or masks move.
 _ROOM = 8
+# Kernel (:data:`~.psf_model.covariance.COLUMNS`) of the pixels of stars, times what the stars show of it.
+_EXPECTED_KERNEL = np.array([1.0, 0.7, 0.0, 2.7, 1.0])
+# Degree of its trend.
+_TREND_ORDER = 2
+# Variance of a pixel is in proportion to its light, and at least that of this fraction of the brightest one's.
+_FAINTEST = 1e-4
+# Times that bad pixels are predicted anew from stars of which some were predicted: an error falls by the fraction of
+# the stars in which a pixel is bad each time.
+_PREDICTIONS = 3
 # Fewest pixels of sky.
 _FEWEST_SKY = 20
 # Fraction of the good pixels, the farthest from the centre, that stands in where fewer are good.
@@ -73,38 +87,125 @@ def inner_pixels(shape: tuple[int, ...], size: int, wide: Shapes) -> tuple[slice
     return np.s_[:, cuts[0] : shape[0] - cuts[0], cuts[1] : shape[1] - cuts[1]]
 
 
+@dataclass(frozen=True, eq=False)
+class FilledStars:
+    """Stars of which bad pixels are filled."""
+
+    images: np.ndarray  #: [n, ny, nx]
+    median_star: np.ndarray  #: [ny, nx], centred on pixel (ny // 2, nx // 2); zero where none has a bad pixel
+    x: np.ndarray  #: centroids from the centre of the stamps [pixel], [n]; NaN where there is none
+    y: np.ndarray
+    usable: np.ndarray  #: stars that can be measured, [n] bool
+    lost: np.ndarray  #: stars of which too little is left (`MOST_MASKED`), [n] bool
+
+    def refilled(
+        self,
+        images: np.ndarray,
+        bad: np.ndarray,
+        masked: np.ndarray,
+        psfs: np.ndarray,
+        pixel_scale: float,
+        weight_fwhm: float,
+    ) -> FilledStars:
+        """Return the stars with those of the indices `masked` filled by their PSFs, [n_masked, size, size].
+
+        `images` and their `bad` pixels are [n, ny, nx].
+        """
+        sigma = weight_sigma(pixel_scale, weight_fwhm)
+        filled, lost, usable, x, y = (v.copy() for v in (self.images, self.lost, self.usable, self.x, self.y))
+        profiles = profiles_of_psfs(psfs, self.median_star, sigma)
+        filled[masked], lost[masked] = fill_by_profiles(
+            images[masked], bad[masked], profiles, x[masked], y[masked], sigma
+        )
+        near = np.stack([x[masked], y[masked]], axis=1)
+        shapes = measure_shapes(filled[masked], pixel_scale, weight_fwhm, centers=near)
+        x[masked], y[masked], usable[masked] = shapes.x, shapes.y, shapes.usable & ~lost[masked]
+        return FilledStars(filled, self.median_star, x, y, usable, lost)
+
+    def bad_within(self, bad: np.ndarray, chosen: np.ndarray, radius: float) -> np.ndarray:
+        """Return whether stars of indices `chosen` have a bad pixel within a radius of their centroid [pixel]."""
+        star, row, column = np.nonzero(bad[chosen])
+        y, x = (
+            pixel - 0.5 * (count - 1) - place[chosen][star]
+            for pixel, count, place in zip((row, column), bad.shape[1:], (self.y, self.x), strict=True)
+        )
+        return np.bincount(star, np.hypot(x, y) < radius, len(chosen)) > 0.0
+
+
 def fill_by_median_star(
-    images: np.ndarray, bad: np.ndarray, pixel_scale: float, weight_fwhm: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    images: np.ndarray,
+    bad: np.ndarray,
+    pixel_scale: float,
+    weight_fwhm: float,
+    earlier: FilledStars | None = None,
+) -> FilledStars:
     """Fill bad pixels of background-subtracted stamps [n, ny, nx] by the median star at each star's place and flux.
 
-    Places depend on the filled pixels, so both are iterated. Returns the filled stamps; the median star [ny, nx],
-    centred on pixel (ny // 2, nx // 2); and the stars of which too little is left (`MOST_MASKED`), [n] bool.
-    Stars that are lost hold the median star in their bad pixels; where no star can be measured, the first guess.
+    Places depend on the filled pixels, so both are iterated, from the places and the median star of `earlier` ones
+    where there are such. Stars that are lost hold the median star in their bad pixels; where no star can be measured,
+    the first guess.
     """
-    filled = fill_symmetric(images, bad)
-    shapes = measure_shapes(filled, pixel_scale, weight_fwhm)
-    x, y, usable = shapes.x, shapes.y, shapes.usable
     sigma = weight_sigma(pixel_scale, weight_fwhm)
     masked, lost = np.flatnonzero(bad.any(axis=(1, 2))), np.zeros(len(images), dtype=bool)
-    star, moving = np.zeros(images.shape[1:]), masked
+    if earlier is None:
+        filled = fill_symmetric(images, bad)
+        shapes = measure_shapes(filled, pixel_scale, weight_fwhm)
+        x, y, usable, star = shapes.x, shapes.y, shapes.usable, np.zeros(images.shape[1:])
+    else:
+        filled, x, y = images.copy(), earlier.x.copy(), earlier.y.copy()
+        usable, star = earlier.usable.copy(), earlier.median_star
+        if not star.any():
+            star = _median_star(images, bad, x, y, sigma)
+        filled[masked] = fill_by_profiles(images[masked], bad[masked], star, x[masked], y[masked], sigma)[0]
+    moving = masked
     for number in range(_MOST_PASSES):
-        if not usable.any():
+        if not (usable.any() and len(moving)):
             break
         if number < _MEDIAN_PASSES:
             star, moving = _median_star(filled[usable], bad[usable], x[usable], y[usable], sigma), masked
-        profiles = np.broadcast_to(star, (len(moving), *star.shape))
-        filled[moving], lost[moving] = fill_by_profiles(
-            images[moving], bad[moving], profiles, x[moving], y[moving], sigma
-        )
-        shapes = measure_shapes(filled[moving], pixel_scale, weight_fwhm)
+        filled[moving], lost[moving] = fill_by_profiles(images[moving], bad[moving], star, x[moving], y[moving], sigma)
+        near = np.stack([x[moving], y[moving]], axis=1)
+        shapes = measure_shapes(filled[moving], pixel_scale, weight_fwhm, centers=near)
         step = np.hypot(shapes.x - x[moving], shapes.y - y[moving])
         x[moving], y[moving] = shapes.x, shapes.y
         usable[moving] = shapes.usable & ~lost[moving]
         moving = moving[usable[moving] & (step > _CONVERGED)]
-        if not len(moving):
-            break
-    return filled, star, lost
+    return FilledStars(filled, star, x, y, usable, lost)
+
+
+def predict_from_others(
+    stars: np.ndarray, bad: np.ndarray, positions: np.ndarray, noise: np.ndarray, pixel_noise: np.ndarray
+) -> np.ndarray:
+    """Predict centred stars each from the others, as far as these show that the PSF varies, [n, ny, nx].
+
+    Parameters
+    ----------
+    stars, bad : array
+        Stars of one flux and their bad pixels, which hold first guesses, [n, ny, nx].
+    positions : array
+        [n, 2].
+    noise : array
+        Variance of the stars' noise over that of the middle one, [n].
+    pixel_noise : array
+        Variance of the noise of the middle star's pixels, [ny, nx].
+    """
+    extent = as_extent(None, positions)
+    terms = design_matrix(positions, extent, _TREND_ORDER)
+    signal = SignalCovariance.of(_EXPECTED_KERNEL, mapped(positions, extent), terms)
+    values, missing = stars.reshape(len(stars), -1), bad.reshape(len(stars), -1)
+    with one_blas_thread():
+        contrasts = Contrasts.of(signal.covariance, noise)
+        mean = values.mean(axis=0)
+        relative = np.maximum(mean, _FAINTEST * mean.max()) / pixel_noise.ravel()
+        relative /= relative.max()
+        variances = relative * contrasts.scale_of(values / np.sqrt(pixel_noise.ravel()), relative)
+        columns = np.flatnonzero(missing.any(axis=0))
+        for _ in range(_PREDICTIONS - 1):
+            of_columns = values[:, columns]
+            predicted = of_columns - contrasts.differences(of_columns, variances[columns])
+            values = values.copy()
+            values[:, columns] = np.where(missing[:, columns], predicted, of_columns)
+        return (values - contrasts.differences(values, variances)).reshape(stars.shape)
 
 
 def fill_by_profiles(
@@ -116,7 +217,8 @@ def fill_by_profiles(
     ----------
     images, bad, profiles : array
         Background-subtracted stamps, their bad pixels, and the profile of each star, of any flux, centred on pixel
-        (ny // 2, nx // 2); [n, ny, nx]. Stars have the flux of least squares in the good pixels under the weight.
+        (ny // 2, nx // 2); [n, ny, nx], profiles or one [ny, nx]. Stars have the flux of least squares in the good
+        pixels under the weight.
     x, y : array
         Centroids from the centre of the stamps [pixel], [n]; NaN counts as the centre.
     sigma : float
@@ -179,7 +281,7 @@ def _median_star(images: np.ndarray, bad: np.ndarray, x: np.ndarray, y: np.ndarr
     shifts = middle - np.stack([x, y], axis=1)
     stars = fourier_shifts(images, *shifts.T)
     stars /= (_weight(shape, middle, sigma) * stars).sum(axis=(1, 2), keepdims=True)
-    masks = np.stack([shift_mask(mask, *shift) for mask, shift in zip(bad, shifts, strict=True)])
+    masks = shift_masks(bad, *shifts.T)
     masks[:, masks.all(axis=0)] = False  # a pixel that is bad in all stars has no better median
     return masked_median(stars, masks)
 

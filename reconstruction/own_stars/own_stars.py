@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.random_streams import stream
-from ...core.statistics import finite_median
+from ...core.statistics import column_median, finite_median, sorted_columns
 from ...core.units import positive_angle, real_array, require_seed
 from ...measure.pixel_masks import fill_symmetric
 from ...measure.shapes import Shapes, fwhm, measure_shapes
@@ -24,12 +24,12 @@ from ..psf_model.colour import as_colours
 from ..psf_model.model import PsfModel, StarOptions
 from ..psf_model.polynomial import as_positions
 from .masked_stars import (
+    FilledStars,
     apart_from_core,
     as_bad_pixels,
     fill_by_median_star,
-    fill_by_profiles,
     inner_pixels,
-    profiles_of_psfs,
+    predict_from_others,
     sky_of_stamps,
     weight_sigma,
 )
@@ -45,9 +45,6 @@ FOLDS = 5
 _SKY = 0.4
 # Rim of a stamp that a shift may bring in from the other side [pixel].
 _RIM = 2
-# Times that bad pixels are filled anew by the model of stars that were filled: the error of a pixel falls by the
-# fraction of the stars in which it is bad each time.
-_MODEL_PASSES = 2
 # Defects that may be masked in a star that stays.
 _MASKABLE = StarFlag.NEIGHBOUR | StarFlag.COSMIC_RAY
 
@@ -93,9 +90,9 @@ def fit_own_stars(
         [n, ny, nx], True for pixels to ignore, besides those that hold no light: not finite, or -1e29 or less (-1e30 of
         SExtractor), copies of dead columns (:func:`~pachon.measure.pixel_masks.copied_pixels`), and neighbours and
         cosmic rays of stars. They are left out of the sky, of fluxes and of noise, and filled before a star is
-        centred: by the median star, then by the model at the star's place. A star is lost only where they hold
-        more than half of its light above half of its peak, or under the weight of the moments: with the flag of its
-        neighbour or cosmic ray, else ``MASKED``.
+        centred: by the median star, then by what the other stars predict at its place. A star is lost only where they
+        hold more than half of its light above half of its peak, or under the weight of the moments: with the flag of
+        its neighbour or cosmic ray, else ``MASKED``.
     seed : int
         Of the parts that are held out.
     **options
@@ -132,61 +129,55 @@ def fit_own_stars(
         sky = np.nan_to_num(level)[:, None, None] if background else 0.0
         return np.where(bad, 0.0, raw_images - sky)[inner], rms
 
-    def select(filled: np.ndarray, lost: np.ndarray, earlier: _CentredStars | None = None) -> _CentredStars:
-        first = measure_shapes(filled, scale, weight)
-        centred = center_stamps(filled, first.x, first.y, size=size, normalize=False)
-        if earlier is None:
-            noise = np.where(rms > 0.0, rms, 1.0)
-            selection = flag_stars(centred, noise, gain=gain, saturation=saturation)
-            flags, defects, apart = selection.flags, selection.masks, np.zeros(len(centred), dtype=bool)
-        else:
-            flags, defects, apart = earlier.flags, earlier.defects, earlier.apart
-        shapes = measure_shapes(centred, scale, weight)
-        flags = np.where(shapes.usable, flags, flags | StarFlag.UNUSABLE)
-        flags = np.where(lost, StarFlag.MASKED, flags)
-        snr = _signal_to_noise(centred, rms, gain)
-        used = ((flags == 0) | (apart & ((flags & ~_MASKABLE) == 0))) & (snr >= min_snr)
-        return _CentredStars(first, centred, shapes, flags, snr, used, defects, apart)
+    def masks_of(filled: FilledStars, chosen: np.ndarray) -> np.ndarray:
+        return center_masks(bad[inner][chosen], filled.x[chosen], filled.y[chosen], size)
 
-    def fit(chosen: np.ndarray, **further_options: Any) -> PsfModel:
+    def centre(filled: FilledStars, stars: Any = slice(None)) -> np.ndarray:
+        return center_stamps(filled.images[stars], filled.x[stars], filled.y[stars], size=size, normalize=False)
+
+    def select(filled: FilledStars, flags: np.ndarray, apart: np.ndarray, centred: np.ndarray) -> _CentredStars:
+        flags = np.where(filled.usable, flags, flags | StarFlag.UNUSABLE)
+        flags = np.where(filled.lost, StarFlag.MASKED, flags)
+        flux, snr = _flux_and_snr(centred, rms, gain)
+        used = ((flags == 0) | (apart & ((flags & ~_MASKABLE) == 0))) & (snr >= min_snr)
+        return _CentredStars(filled, centred, flags, apart, flux, snr, used)
+
+    def predict_used(stars: _CentredStars, masks: np.ndarray) -> np.ndarray:
+        flux, snr = stars.flux[stars.used], stars.snr[stars.used]
+        unit = stars.images[stars.used] / flux[:, None, None]
+        middle = int(np.argsort(snr, kind="stable")[len(snr) // 2])
+        light = np.maximum(unit.mean(axis=0), 0.0) / (flux[middle] * gain)
+        pixel_noise = (rms[stars.used][middle] / flux[middle]) ** 2 + light
+        return predict_from_others(unit, masks, places[stars.used], (snr[middle] / snr) ** 2, pixel_noise)
+
+    def fit(chosen: np.ndarray) -> PsfModel:
         span = as_extent(extent, places[stars.used])
         return PsfModel.fit(
             stars.images[chosen],
             places[chosen],
             extent=span,
             colour=colours_of(chosen),
-            **({"gain": gain} | model_options | further_options),
+            **({"gain": gain} | model_options),
         )
-
-    def fit_again(model: PsfModel | None, *, refined: bool = False) -> PsfModel:
-        """Fit the used stars by the covariances of an earlier model of nearly the same ones, or searched from there."""
-        interpolation = None if model is None else model.interpolation
-        if not isinstance(interpolation, kriging.FittedKriging):
-            return fit(np.flatnonzero(stars.used))
-        earlier_covariances = kriging.KrigingOfCovariances(
-            order=interpolation.order, covariances=interpolation.covariances, refined=refined
-        )
-        return fit(np.flatnonzero(stars.used), interpolation=earlier_covariances)
 
     def colours_of(chosen: np.ndarray) -> np.ndarray | None:
         return None if colours is None else colours[chosen]
 
     def predict(model: PsfModel) -> np.ndarray:
+        coefficients = model.interpolation.left_out(parts, model.coefficients)
+        if coefficients is not None:
+            return model.basis.at(coefficients)
         predicted = np.empty((len(used_indices), size, size))
         for held_out_indices in parts:
-            interpolation = model.interpolation.without(held_out_indices, model.coefficients)
-            if interpolation is None:
-                fitted_indices = np.setdiff1d(np.arange(len(used_indices)), held_out_indices)
-                part_model = fit(used_indices[fitted_indices])
-            else:
-                part_model = replace(model, interpolation=interpolation)
+            fitted_indices = np.setdiff1d(np.arange(len(used_indices)), held_out_indices)
             predicted_indices = used_indices[held_out_indices]
+            part_model = fit(used_indices[fitted_indices])
             predicted[held_out_indices] = part_model.at(places[predicted_indices], colour=colours_of(predicted_indices))
         return predicted
 
     inner = np.s_[:, :, :]
     images, rms = less_sky(bad)
-    filled, lost = fill_symmetric(images, bad), np.zeros(len(images), dtype=bool)
+    filled = fill_symmetric(images, bad)
     wide = measure_shapes(filled, scale, 0.25 * side * scale)
     inner = inner_pixels(images.shape[1:], size, wide)
     images, filled = images[inner], filled[inner]
@@ -196,58 +187,50 @@ def fit_own_stars(
     if not np.isfinite(weight):
         raise DomainError(f"none of {len(images)} stamps has a star in its middle")
 
-    def width_of(complete: np.ndarray, filled: np.ndarray) -> float:
-        """Return the median width of complete stars; only those with bad pixels differ from the stars before."""
-        changed = complete & bad.any(axis=(1, 2))
-        widths[changed] = fwhm(filled[changed], scale)
-        return finite_median(widths[complete])
-
-    def fill() -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        filled, median_star, lost = fill_by_median_star(images, bad[inner], scale, weight)
-        complete = wide.usable & ~lost
+    def fill(earlier: FilledStars | None = None) -> FilledStars:
+        filled_stars = fill_by_median_star(images, bad[inner], scale, weight, earlier)
+        complete = wide.usable & ~filled_stars.lost
         if not complete.any():
-            require_stars(complete, np.where(lost, StarFlag.MASKED, StarFlag.UNUSABLE), FEWEST_STARS)
-        return filled, median_star, lost, width_of(complete, filled)
+            require_stars(complete, np.where(filled_stars.lost, StarFlag.MASKED, StarFlag.UNUSABLE), FEWEST_STARS)
+        return filled_stars
 
-    if bad.any():
-        filled, median_star, lost, weight = fill()
-    stars = select(filled, lost)
-    stars = stars.with_defects_apart(weight_sigma(scale, weight))
-    if stars.apart.any():
-        first = stars.first
-        bad = bad | decenter_masks(stars.defects, first.x, first.y, bad.shape[1:])
+    filled_stars = fill()
+    centred = centre(filled_stars)
+    selection = flag_stars(centred, np.where(rms > 0.0, rms, 1.0), gain=gain, saturation=saturation)
+    flags, none_apart = selection.flags, np.zeros(len(images), dtype=bool)
+    stars = select(filled_stars, flags, none_apart, centred)
+    apart = stars.with_defects_apart(selection.masks, weight_sigma(scale, weight))
+    if apart.any():
+        defects = selection.masks & apart[:, None, None]
+        bad = bad | decenter_masks(defects, filled_stars.x, filled_stars.y, bad.shape[1:])
         images, rms = less_sky(bad)
-        filled, median_star, lost, weight = fill()
-        stars = select(filled, lost, stars)
+        filled_stars = fill(filled_stars)
+        stars = select(filled_stars, flags, apart, centre(filled_stars))
     _require_used(stars, min_snr, gain)
-    filling_model: PsfModel | None = None
-    if bad.any():
-        masked = np.asarray(bad.any(axis=(1, 2)))
-        complete = wide.usable & ~lost
-        for _ in range(_MODEL_PASSES):
-            filling_model = fit_again(filling_model)
-            psfs = filling_model.at(places[masked], colour=colours_of(masked))
-            sigma = weight_sigma(scale, weight)
-            filled[masked], lost[masked] = fill_by_profiles(
-                images[masked],
-                bad[inner][masked],
-                profiles_of_psfs(psfs, median_star, sigma),
-                stars.first.x[masked],
-                stars.first.y[masked],
-                sigma,
-            )
-            weight = width_of(complete, filled)
-            stars = select(filled, lost, stars)
-            _require_used(stars, min_snr, gain)
+    masked = np.flatnonzero(stars.used & bad.any(axis=(1, 2)))
+    if len(masked):
+        psfs = predict_used(stars, masks_of(stars.filled, stars.used))
+        psfs = psfs[np.searchsorted(np.flatnonzero(stars.used), masked)]
+        filled_stars = stars.filled.refilled(images, bad[inner], masked, psfs, scale, weight)
+        # Bad pixels farther out than the width are no part of it.
+        changed = masked[wide.usable[masked] & filled_stars.bad_within(bad[inner], masked, weight / scale)]
+        widths[changed] = fwhm(filled_stars.images[changed], scale)
+        weight = finite_median(widths[wide.usable & ~filled_stars.lost])
+        centred = stars.images.copy()
+        centred[masked] = centre(filled_stars, masked)
+        stars = select(filled_stars, stars.flags, apart, centred)
+    shapes = measure_shapes(stars.images, scale, weight)
+    stars = stars.usable_ones(shapes.usable)
+    _require_used(stars, min_snr, gain)
     used = stars.used
     used_indices = np.flatnonzero(used)
     parts = np.array_split(
         stream(require_seed(seed), "held-out stars").permutation(len(used_indices)), min(FOLDS, len(used_indices))
     )
     good = stars.images[used]
-    used_masks = center_masks(bad[inner][used], stars.first.x[used], stars.first.y[used], size)
+    used_masks = masks_of(stars.filled, used)
     weightless = used_masks if used_masks.any() else None
-    model = fit_again(filling_model, refined=True)
+    model = fit(used_indices)
     predicted = predict(model)
     psf = predicted.mean(axis=0)
     stamps_used = good / good.sum(axis=(1, 2), keepdims=True)
@@ -263,7 +246,7 @@ def fit_own_stars(
         stars.snr,
         stars.flags,
         used,
-        stars.shapes,
+        shapes,
         held_out,
         stamps_used,
         predicted,
@@ -279,24 +262,30 @@ def fit_own_stars(
 class _CentredStars:
     """Stars of which bad pixels are filled, centred, with their defects."""
 
-    first: Shapes  #: of the stamps before they are centred
+    filled: FilledStars  #: before they are centred
     images: np.ndarray  #: [n, size, size]
-    shapes: Shapes  #: of the centred stars
     flags: np.ndarray  #: :class:`~.StarFlag` bits, [n]
+    apart: np.ndarray  #: stars whose only defects are apart from their core, and masked, bool [n]
+    flux: np.ndarray  #: [n]
     snr: np.ndarray  #: [n]
     used: np.ndarray  #: bool [n]
-    defects: np.ndarray  #: pixels of neighbours and cosmic rays, bool [n, size, size]
-    apart: np.ndarray  #: stars whose only defects are apart from their core, and masked, bool [n]
 
-    def with_defects_apart(self, sigma: float) -> _CentredStars:
-        """Return the stars with those marked whose defects are apart from their core; `sigma` as of the moments."""
+    def with_defects_apart(self, defects: np.ndarray, sigma: float) -> np.ndarray:
+        """Return the stars whose only defects, bool [n, size, size], are apart from their core, bool [n].
+
+        `sigma` is that of the weight of the moments.
+        """
         good = self.images[self.flags == 0]
         with_defects = (self.flags != 0) & ((self.flags & ~_MASKABLE) == 0)
         if not len(good) or not with_defects.any():
-            return self
+            return np.zeros(len(self.flags), dtype=bool)
         median_star = np.median(good / good.sum(axis=(1, 2), keepdims=True), axis=0)
-        apart = with_defects & apart_from_core(self.defects, median_star, sigma)
-        return replace(self, apart=apart, defects=self.defects & apart[:, None, None])
+        return with_defects & apart_from_core(defects, median_star, sigma)
+
+    def usable_ones(self, usable: np.ndarray) -> _CentredStars:
+        """Return the stars with those flagged, and left out, that have no shape."""
+        flags = np.where(usable | self.filled.lost, self.flags, self.flags | StarFlag.UNUSABLE)
+        return replace(self, flags=flags, used=self.used & usable)
 
 
 def _require_used(stars: _CentredStars, min_snr: float, gain: float) -> None:
@@ -312,16 +301,19 @@ def _require_used(stars: _CentredStars, min_snr: float, gain: float) -> None:
     require_stars(stars.used, np.where(stars.used, 0, stars.flags), FEWEST_STARS, reason)
 
 
-def _signal_to_noise(stamps: np.ndarray, rms: np.ndarray, gain: float) -> np.ndarray:
-    """Return the S/N of PSF photometry, [n], with the median star as the PSF; NaN where there is no light."""
+def _flux_and_snr(stamps: np.ndarray, rms: np.ndarray, gain: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return flux and S/N of PSF photometry, [n], with the median star as the PSF; NaN where there is no light."""
     total = stamps.sum(axis=(1, 2))
-    psf = np.nanmedian(stamps / np.where(total > 0.0, total, np.nan)[:, None, None], axis=0)
+    bright = total > 0.0
+    if not bright.any():
+        return np.full(len(stamps), np.nan), np.full(len(stamps), np.nan)
+    psf = column_median(sorted_columns((stamps[bright] / total[bright, None, None]).reshape(bright.sum(), -1)))
     psf /= psf.sum()
     squares = (psf**2).sum()
     # The sum over a wide stamp has ten times the noise of the fit.
-    flux = (stamps * psf).sum(axis=(1, 2)) / squares
+    flux = (stamps.reshape(len(stamps), -1) * psf).sum(axis=1) / squares
     flux = np.where(flux > 0.0, flux, np.nan)
-    return flux / np.sqrt(flux / gain + rms**2 / squares)
+    return flux, flux / np.sqrt(flux / gain + rms**2 / squares)
 
 
 def _spread(shapes: Shapes, used: np.ndarray) -> Shapes:

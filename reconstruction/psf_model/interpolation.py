@@ -178,10 +178,10 @@ class FittedInterpolation:
         """Return coefficients [n, k] of the stars less their prediction by the other stars; NaN where there is none."""
         raise NotImplementedError
 
-    def without(self, held_out: np.ndarray, coefficients: np.ndarray) -> Self | None:
-        """Return the interpolation of all stars but some for their predictions; None where it takes another fit.
+    def left_out(self, parts: list[np.ndarray], coefficients: np.ndarray) -> np.ndarray | None:
+        """Return predictions [n, k] of all stars, those of a part by all others; None where it takes another fit.
 
-        `held_out` are indices of the stars that are left out, `coefficients` [n, k] those of all stars.
+        `parts` are indices of the stars that are left out together, of all stars in all; `coefficients` [n, k] theirs.
         """
         return None
 

@@ -23,7 +23,16 @@ from ...core.errors import DomainError
 from ...core.statistics import RMS_PER_MAD, finite_row_medians, row_medians
 from ...core.threads import one_blas_thread
 from .colour import FittedColour
-from .covariance import COLUMNS, Covariances, fit_covariances, krige, krige_mean, predict
+from .covariance import (
+    COLUMNS,
+    Covariances,
+    differences_left_out,
+    inverse_covariance,
+    krige,
+    krige_mean,
+    predict,
+)
+from .covariance_search import fit_covariances
 from .file_parts import ModelParts
 from .interpolation import FittedInterpolation, Interpolation, StarField
 from .pixel_fields import PixelFields, SignalCovariance, fit_pixel_fields, krige_residuals, residuals_left_out
@@ -67,12 +76,6 @@ class Kriging(Interpolation):
 
     order: int | Literal["auto"] = ORDER
 
-    def covariances_of(
-        self, places: np.ndarray, numbers: np.ndarray, noise: np.ndarray, terms: np.ndarray, colour_count: int
-    ) -> Covariances:
-        """Return the covariances that stars show; arguments as those of :func:`~.covariance.fit_covariances`."""
-        return fit_covariances(places, numbers, noise, terms, colour_count=colour_count)
-
     def fit(self, stars: StarField) -> FittedKriging:
         """Krige the coefficients of stars by the covariances of their shapes."""
         mean = stars.basis.mean
@@ -83,7 +86,7 @@ class Kriging(Interpolation):
         noise = np.maximum(noise, _LEAST_NOISE * (numbers**2).mean(axis=0) + np.finfo(float).tiny)
         places = mapped(stars.positions, stars.extent)
         terms, colour_count = stars.with_colour_terms(), stars.colour_terms.shape[1]
-        covariances = self.covariances_of(places, numbers, noise, terms, colour_count)
+        covariances = fit_covariances(places, numbers, noise, terms, colour_count=colour_count)
         of_stars = (noise / np.median(noise, axis=0)).mean(axis=1)
         fields, count = None, stars.terms.shape[1]
         if stars.basis.kind.has_components:
@@ -111,25 +114,6 @@ class Kriging(Interpolation):
             alpha,
             fields,
             colour=stars.fitted_colour(trend[count:], covariances.colour_probability),
-        )
-
-
-@dataclass(frozen=True)
-class KrigingOfCovariances(Kriging):
-    """Kriging by covariances that other stars of the CCD have shown: the search for them is most of a fit's time."""
-
-    covariances: Covariances | None = None
-    refined: bool = False  #: whether to search from there, rather than to take them as they are
-
-    def covariances_of(
-        self, places: np.ndarray, numbers: np.ndarray, noise: np.ndarray, terms: np.ndarray, colour_count: int
-    ) -> Covariances:
-        """Return the covariances, or those that the stars show where there are none or they are to be refined."""
-        same_kind = self.covariances is not None and self.covariances.coloured == (colour_count > 0)
-        if same_kind and not self.refined and self.covariances is not None:
-            return self.covariances
-        return fit_covariances(
-            places, numbers, noise, terms, colour_count=colour_count, earlier=self.covariances if same_kind else None
         )
 
 
@@ -179,8 +163,8 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
             shape_differences = differences(numbers) @ self.fields.response
             return shape_differences + residuals_left_out(residuals, self.fields, signal, noise)
 
-    def without(self, held_out: np.ndarray, coefficients: np.ndarray) -> Self | None:
-        """Return the interpolation of all stars but some; arguments as those of the base class.
+    def left_out(self, parts: list[np.ndarray], coefficients: np.ndarray) -> np.ndarray | None:
+        """Return predictions of all stars, each part of them by the others; arguments as those of the base class.
 
         Covariances, the response of the pixels to the shape, and the noise are those of all stars, as in
         :meth:`leave_one_out`; the search for them is most of a fit's time. None where the components are not pixels:
@@ -188,26 +172,23 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
         """
         if self.fields is None or self.weights is None:
             return None
-        fitted = np.setdiff1d(np.arange(len(coefficients)), held_out)
-        points = mapped(self.positions[fitted], self.extent)
-        noise, terms = 1.0 / self.weights[fitted], self.terms()[fitted]
+        points = mapped(self.positions, self.extent)
+        noise, terms = 1.0 / self.weights, self.terms()
         colour_count = 0 if self.colour is None else len(self.colour.slope)
-        count = terms.shape[1] - colour_count
+        predictions = np.empty(coefficients.shape)
         with one_blas_thread():
-            numbers, residuals = self.fields.split(coefficients[fitted])
-            shape_trend, dual = krige_mean(points, numbers, terms, self.covariances, noise, colour_count=colour_count)
+            numbers, residuals = self.fields.split(coefficients)
+            shapes = np.zeros(numbers.shape)
+            for kernel, probability in self.covariances.weighted():
+                inverse = inverse_covariance(points, terms, kernel, noise, colour_count)
+                shapes += probability * (numbers - differences_left_out(inverse, inverse @ numbers, parts))
             signal = SignalCovariance.of(self.kernel, points, terms, colour_count)
-            residual_trend, residual_dual = krige_residuals(residuals, self.fields, signal, noise)
-            trend = shape_trend @ self.fields.response + residual_trend
-            alpha = dual @ self.fields.response + residual_dual
-        return replace(
-            self,
-            positions=self.positions[fitted],
-            weights=self.weights[fitted],
-            polynomial=trend[:count],
-            alpha=alpha,
-            colour=None if self.colour is None else replace(self.colour, slope=trend[count:]),
-        )
+            for part in parts:
+                others = np.setdiff1d(np.arange(len(points)), part)
+                trend, dual = krige_residuals(residuals[others], self.fields, signal.of_stars(others), noise[others])
+                predictions[part] = trend[0] + signal.covariance[np.ix_(part, others)] @ dual
+            predictions += shapes @ self.fields.response
+        return predictions
 
     def truncated(self, count: int) -> Self:
         """Return the interpolation of the first components only."""

@@ -90,6 +90,10 @@ class SignalCovariance:
         covariance = variance * np.exp(-pair_distances(points, points) / length) + (terms * variances) @ terms.T
         return cls(terms, variances, covariance)
 
+    def of_stars(self, chosen: np.ndarray) -> SignalCovariance:
+        """Return that of some of the stars."""
+        return SignalCovariance(self.terms[chosen], self.trend_variances, self.covariance[np.ix_(chosen, chosen)])
+
 
 @dataclass(frozen=True, eq=False)
 class Contrasts:
@@ -117,6 +121,10 @@ class Contrasts:
     def precision(self, scales: np.ndarray) -> np.ndarray:
         """Return the diagonals of the matrices of :meth:`dual`, [n, k]."""
         return np.asarray(self.axes**2 @ (1.0 / (1.0 + scales * self.variances[:, None])))
+
+    def differences(self, values: np.ndarray, scales: np.ndarray) -> np.ndarray:
+        """Return values [n, k] less their prediction by the other stars, [n, k] (Dubrule 1983)."""
+        return self.dual(values, scales) / self.precision(scales)
 
     def scale_of(self, values: np.ndarray, relative: np.ndarray) -> float:
         """Return the factor of the variances `relative` [k], 1 at most, of values [n, k] that has the largest evidence.
@@ -232,4 +240,4 @@ def residuals_left_out(
 ) -> np.ndarray:
     """Return residuals [n, n_pixels] less their prediction by the other stars (Dubrule 1983)."""
     contrasts = Contrasts.of(signal.covariance, noise)
-    return fields.shapeless(contrasts.dual(residuals, fields.variances) / contrasts.precision(fields.variances))
+    return fields.shapeless(contrasts.differences(residuals, fields.variances))

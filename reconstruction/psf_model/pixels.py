@@ -40,11 +40,10 @@ class Pixels(Basis):
         self, stars: CleanStars, shape: tuple[int, int], count: int, weights: np.ndarray | None = None
     ) -> PixelGrid:
         """Return the mean of stars of a shape (ny, nx), and unit vectors."""
-        return PixelGrid(
-            stars.mean.reshape(shape),
-            unit_images(shape),
-            eigenvalues_of(np.linalg.svd(stars.deviations, compute_uv=False), stars),
-        )
+        # By products of the stars, in a fraction of the time of a singular value decomposition.
+        rows = stars.deviations if len(stars.deviations) < stars.mean.size else stars.deviations.T
+        singular = np.sqrt(np.maximum(np.linalg.eigvalsh(rows @ rows.T)[::-1], 0.0))
+        return PixelGrid(stars.mean.reshape(shape), unit_images(shape), eigenvalues_of(singular, stars))
 
 
 @dataclass(frozen=True, eq=False)

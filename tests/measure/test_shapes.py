@@ -225,10 +225,27 @@ def test_bad_arguments():
 def test_area_above_a_level_takes_the_slope_of_every_pixel():
     rng = np.random.default_rng(8)
     y, x = np.indices((40, 33))
-    for noise in (0.0, 0.02, 0.5):
-        image = np.exp(-0.5 * ((x - 15.0) ** 2 + (y - 21.0) ** 2) / 36.0) + noise * rng.normal(size=x.shape)
+    noise = np.array([0.0, 0.02, 0.5])[:, None, None] * rng.normal(size=(3, *x.shape))
+    images = np.exp(-0.5 * ((x - 15.0) ** 2 + (y - 21.0) ** 2) / 36.0) + noise
+    areas = []
+    for image in images:
         slope = np.hypot(*np.gradient(image)[::-1])
         border = np.abs(image - 0.5) < 0.5 * slope
         covered = (image > 0.5).astype(float)
         covered[border] = 0.5 + (image[border] - 0.5) / slope[border]
-        assert shapes._area_above(image, 0.5) == covered.sum()
+        areas.append(covered.sum())
+    assert shapes._areas_above(images, np.full(3, 0.5)) == pytest.approx(areas, rel=1e-14)
+
+
+def test_steps_from_near_the_centroid_end_where_others_do():
+    rng = np.random.default_rng(2)
+    y, x = np.indices((25, 25)) - 12.0
+    offsets = rng.uniform(-2.0, 2.0, (6, 2))
+    images = np.exp(-0.5 * ((x - offsets[:, :1, None]) ** 2 + 1.2 * (y - offsets[:, 1:, None]) ** 2) / 2.0**2)
+    one = measure_shapes(images, PIXEL, WEIGHT)
+    starts = np.where(np.arange(6)[:, None] == 3, np.nan, offsets + 0.01)
+    other = measure_shapes(images, PIXEL, WEIGHT, centers=starts, max_iterations=6)
+    for name in ("x", "y", "e1", "size"):
+        assert getattr(other, name) == pytest.approx(getattr(one, name), abs=1e-10)
+    with pytest.raises(DomainError, match=r"centers have shape \(2,\): expected \(6, 2\)"):
+        measure_shapes(images, PIXEL, WEIGHT, centers=np.zeros(2))

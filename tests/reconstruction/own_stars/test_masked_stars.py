@@ -6,7 +6,7 @@ import pytest
 from pachon.core.errors import DomainError
 from pachon.measure.pixel_masks import bad_pixels, fill_symmetric
 from pachon.measure.shapes import measure_shapes
-from pachon.measure.stamps import center_masks, shift_mask
+from pachon.measure.stamps import center_masks, shift_masks
 from pachon.measure.star_selection import StarFlag
 from pachon.reconstruction.own_stars.masked_stars import (
     fill_by_profiles,
@@ -267,9 +267,9 @@ def test_stars_without_noise_are_filled_exactly():
 def test_masks_move_with_their_stars():
     mask = np.zeros((SIZE, SIZE), dtype=bool)
     mask[10, 12] = True
-    assert np.array_equal(np.argwhere(shift_mask(mask, 2.0, -3.0)), [[7, 14]])
     # A shift by a quarter of a pixel leaves three quarters on one pixel; by a twentieth it is no overlap to speak of.
-    assert np.array_equal(np.argwhere(shift_mask(mask, 0.25, 0.05)), [[10, 12], [10, 13]])
+    moved = shift_masks(np.stack([mask, mask]), np.array([2.0, 0.25]), np.array([-3.0, 0.05]))
+    assert np.array_equal(np.argwhere(moved), [[0, 7, 14], [1, 10, 12], [1, 10, 13]])
     centred = center_masks(mask[None], np.array([-2.0]), np.array([np.nan]), 11)
     assert np.array_equal(
         np.argwhere(centred[0]), np.argwhere(mask[11:22, 11:22]) if mask[11:22, 11:22].any() else np.empty((0, 2))

@@ -6,8 +6,8 @@ import pytest
 import pachon
 from pachon.core.errors import ConfigError, DomainError
 from pachon.measure.shapes import measure_shapes
-from pachon.reconstruction.psf_model import covariance
 from pachon.reconstruction.psf_model.colour import ColourTerm
+from pachon.reconstruction.psf_model.covariance_search import Posterior
 from pachon.reconstruction.psf_model.kriging import Kriging
 from pachon.reconstruction.psf_model.pixels import Pixels
 from pachon.reconstruction.psf_model.polynomial import design_matrix
@@ -161,16 +161,19 @@ def test_the_slope_of_the_posterior_with_colours_is_its_change():
     distance = np.hypot(*np.moveaxis(points[:, None] - points, -1, 0))
     terms = np.column_stack([design_matrix(points, EXTENT, 2), rng.normal(size=(25, 3))])
     for process in (True, False):
-        posterior = covariance.Posterior(
+        posterior = Posterior(
             distance, 3 * rng.normal(size=(25, 3)), rng.uniform(0.1, 2.0, 25), terms, np.zeros(6), np.full(6, 2.0), 3
         )
         at, present = rng.normal(size=6), np.array([process, process, True, True, True, True])
-        value, slope = posterior.negative_log_posterior(at, present)
+        exact = posterior.negative_log_posterior(at[None], present[None])
         for column in range(6):
             step = np.eye(6)[column] * 1e-5
-            above, below = (posterior.negative_log_posterior(at + sign * step, present)[0] for sign in (1.0, -1.0))
+            around = posterior.negative_log_posterior(np.stack([at + step, at - step]), np.stack([present] * 2))
+            above, below = around.value
             # Rounding of values near 100, over the step.
-            assert slope[column] == pytest.approx((above - below) / 2e-5, abs=1e-7 * abs(value))
+            assert exact.slope[0, column] == pytest.approx((above - below) / 2e-5, abs=1e-7 * abs(exact.value[0]))
+            change = (around.slope[0] - around.slope[1]) / 2e-5
+            np.testing.assert_allclose(exact.curvature[0, column], change, atol=1e-6 * np.abs(exact.curvature).max())
 
 
 @pytest.mark.parametrize(

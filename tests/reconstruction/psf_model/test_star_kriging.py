@@ -6,8 +6,8 @@ import pytest
 from pachon.core.errors import ConfigError, DomainError
 from pachon.core.threads import one_blas_thread
 from pachon.measure.shapes import measure_shapes
-from pachon.reconstruction.psf_model import covariance, kriging
-from pachon.reconstruction.psf_model.covariance import fit_covariances
+from pachon.reconstruction.psf_model import kriging
+from pachon.reconstruction.psf_model.covariance_search import Posterior, fit_covariances
 from pachon.reconstruction.psf_model.model import PsfModel
 from pachon.reconstruction.psf_model.polynomial import design_matrix
 
@@ -127,22 +127,37 @@ def test_the_slope_of_the_posterior_is_its_change(process):
     points = rng.uniform(-1.0, 1.0, (25, 2))
     distance = np.hypot(*np.moveaxis(points[:, None] - points, -1, 0))
     terms = design_matrix(points, EXTENT, 4)
-    posterior = covariance.Posterior(
+    posterior = Posterior(
         distance, 3.0 * rng.normal(size=(25, 3)), rng.uniform(0.1, 2.0, 25), terms, np.zeros(7), np.full(7, 2.0)
     )
     at, present = rng.normal(size=7), np.array([process, process, True, True, True, False, True])
-    value, slope = posterior.negative_log_posterior(at, present)
-    variance, length, floor, *trend = np.where(present, np.exp(at), 0.0)
-    covariance_matrix = np.diag(posterior.noise + floor) + (variance * np.exp(-distance / length) if process else 0.0)
-    covariance_matrix += terms @ np.diag(np.repeat([1e4, *trend], [1, 2, 3, 4, 5])) @ terms.T
+    value, slope, curvature, information = (
+        each[0] for each in vars(posterior.negative_log_posterior(at[None], present[None])).values()
+    )
+
+    def covariance_at(logarithms):
+        variance, length, floor, *trend = np.where(present, np.exp(logarithms), 0.0)
+        process_part = variance * np.exp(-distance / length) if process else 0.0
+        trend_part = terms @ np.diag(np.repeat([1e4, *trend], [1, 2, 3, 4, 5])) @ terms.T
+        return np.diag(posterior.noise + floor) + process_part + trend_part
+
+    covariance_matrix = covariance_at(at)
     likelihood = 1.5 * np.linalg.slogdet(covariance_matrix)[1]
     likelihood += 0.5 * np.sum(posterior.numbers * np.linalg.solve(covariance_matrix, posterior.numbers))
     assert value == pytest.approx(likelihood + 0.5 * ((at[present] / 2.0) ** 2).sum(), rel=1e-10)
     for column in range(7):
         step = np.eye(7)[column] * 1e-5
-        above, below = (posterior.negative_log_posterior(at + sign * step, present)[0] for sign in (1.0, -1.0))
+        around = posterior.negative_log_posterior(np.stack([at + step, at - step]), np.stack([present] * 2))
+        above, below = around.value
         # Rounding of values near 100, over the step.
         assert slope[column] == pytest.approx((above - below) / 2e-5, abs=1e-7 * abs(value))
+        change = (around.slope[0] - around.slope[1]) / 2e-5
+        np.testing.assert_allclose(curvature[column], change, atol=1e-6 * np.abs(curvature).max())
+    # Fisher's information of Gaussian numbers: half the trace of C^-1 dC C^-1 dC' for each of three.
+    changes = [(covariance_at(at + step) - covariance_at(at - step)) / 2e-5 for step in 1e-5 * np.eye(7)]
+    relative = np.linalg.solve(covariance_matrix, np.stack(changes))
+    expected = 1.5 * np.einsum("aij,bji->ab", relative, relative) + np.diag(np.where(present, 0.25, 0.0))
+    np.testing.assert_allclose(information, expected, atol=1e-6 * np.abs(expected).max())
 
 
 @pytest.fixture(scope="module")
@@ -257,34 +272,3 @@ def test_stamps_that_are_not_in_electrons_are_noticed():
         PsfModel.fit(stars, places, **OPTIONS, weights=np.ones(12))
     with pytest.raises(DomainError, match="expected places apart for interpolation = 'kriging'"):
         PsfModel.fit(stars, np.vstack([places[:11], places[:1]]), **OPTIONS)
-
-
-@pytest.mark.long
-def test_a_search_from_earlier_covariances_ends_where_one_without_them_does(monkeypatch):
-    counts = [0]
-    posterior = covariance.Posterior.negative_log_posterior
-
-    def counted(self, *arguments):
-        counts[-1] += 1
-        return posterior(self, *arguments)
-
-    monkeypatch.setattr(covariance.Posterior, "negative_log_posterior", counted)
-
-    def searched(*arguments, **options):
-        counts.append(0)
-        return fit_covariances(*arguments, **options)
-
-    rng = np.random.default_rng(4)
-    for degree, colour_count in ((4, 0), (1, 2)):
-        points, numbers, noise, trend_terms = exact_fields(degree, count=40)
-        terms = np.hstack([trend_terms, (rng.normal(size=(len(points), 1)) * [1.0, 0.5])[:, :colour_count]])
-        earlier = fit_covariances(points, numbers, noise, terms, colour_count=colour_count)
-        nearly_same = numbers + 1e-5 * rng.normal(size=numbers.shape)  # a thousandth of the noise
-        fresh = searched(points, nearly_same, noise, terms, colour_count=colour_count)
-        refined = searched(points, nearly_same, noise, terms, colour_count=colour_count, earlier=earlier)
-        assert counts[-1] < 0.6 * counts[-2]
-        assert list(refined.forms()) == list(fresh.forms())
-        np.testing.assert_allclose(refined.probabilities, fresh.probabilities, rtol=0.0, atol=2e-3)
-        other_terms = covariance.Covariances(earlier.kernels, earlier.probabilities, optima=earlier.optima[:-1])
-        without = fit_covariances(points, nearly_same, noise, terms, colour_count=colour_count, earlier=other_terms)
-        assert np.array_equal(without.kernels, fresh.kernels)
