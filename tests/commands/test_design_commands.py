@@ -15,7 +15,10 @@ TWO = ["--field-deg", "0", "--field-deg", "0.4"]
 #: Options that make every command quick, and words of its table.
 COMMANDS = {
     "spots": ([*TWO, "--sampling", "rings", "--rays", "6"], ("rms [µm]", "80 % [arcsec]")),
-    "focus": ([*TWO, "--range-um", "-10", "10", "--steps", "3"], ("best for the spot [µm]", "are smallest with the detector at")),
+    "focus": (
+        [*TWO, "--range-um", "-10", "10", "--steps", "3"],
+        ("best for the spot [µm]", "are smallest with the detector at"),
+    ),
     "zernikes": ([*TWO, "--jmax", "11"], ("7 coma y", "obscuration")),
     "rays": (TWO, ("incidence [deg]", "[arcsec/µm]")),
     "distortion": ([], ("focal length at the axis", "largest distortion")),
