@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Option
@@ -97,7 +97,7 @@ def run_command(
     from ..pipeline.run import run
     from ..pipeline.simulate.ccd_loop import left_out_line
 
-    options = {
+    options: dict[str, Any] = {
         "ccds": chosen_ccds(ccds, raft, all_ccds),
         "seed": seed,
         "stars__truth": truth_stars,

@@ -158,8 +158,8 @@ def visits_command(
             quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers
         ) as execution:
             base_folder = None if config is None else config.parent
-            result = run_night(night_config, out, base=base_folder, part=part_of(part), execution=execution)
-        show_night(result, out, table, quiet=quiet, as_json=as_json)
+            night_result = run_night(night_config, out, base=base_folder, part=part_of(part), execution=execution)
+        show_night(night_result, out, table, quiet=quiet, as_json=as_json)
         return
     if not stack:
         require_list(

@@ -72,11 +72,12 @@ def verdict(summary: dict[str, Any]) -> str:
     """Return the result of a study in one sentence."""
     unit = f" {summary['unit']}" if summary["unit"] else ""
     draws, lost = summary["draws"], summary["lost"]
-    offender = next(iter(summary["worst_offenders"]), None)
-    # An end without light is NaN, which costs most.
-    costs = offender is not None and any(offender[end] != summary["nominal"] for end in ("lower_end", "upper_end"))
-    costliest = f"; {offender['name']} costs most" if costs else ""
-    dark = f"; {lost} of them have no light" if lost else ""
+    costliest = ""
+    for offender in summary["worst_offenders"][:1]:
+        # An end without light is NaN, which costs most.
+        if any(offender[end] != summary["nominal"] for end in ("lower_end", "upper_end")):
+            costliest = f"; {offender['name']} costs most"
+    dark = f"; {lost} without light" if lost else ""
     telescopes = "the one telescope drawn" if draws == 1 else f"{draws} telescopes drawn"
     if "yield" in summary:
         met = f"{100 * summary['yield']['fraction']:.1f} % of {telescopes}"
@@ -86,10 +87,11 @@ def verdict(summary: dict[str, Any]) -> str:
         return f"No light arrives in any of {telescopes}{costliest}."
     median, high = (summary[f"reached_by_{percent}_percent"] for percent in (50, 95))
     texts = [f"{value:.4g}{unit}" if math.isfinite(value) else "no light" for value in (median, high)]
-    return (
-        f"Of {telescopes}, half reach {texts[0]} and 95 % {texts[1]}, where the design has "
-        f"{summary['nominal']:.4g}{unit}{dark}{costliest}."
-    )
+    design = f"{summary['nominal']:.4g}{unit}"
+    if draws == 1:
+        return f"The one telescope drawn reaches {texts[0]}, where the design has {design}{costliest}."
+    reached = f"half reach {texts[0]} and 95 % {texts[1]}"
+    return f"Of {telescopes}, {reached}, where the design has {design}{dark}{costliest}."
 
 
 def _drawn(summary: dict[str, Any]) -> list[tuple[str, str]]:

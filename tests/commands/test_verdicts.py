@@ -103,10 +103,14 @@ def tolerance_summary(draws=100, lost=0, offenders=((9.0, 9.5),), **changes):
         # The lower end has no light: it costs most. Of the draws 10 are dark, so 95 % reach nothing.
         (
             tolerance_summary(lost=10, offenders=[(NAN, 9.0)], reached_by_95_percent=math.inf),
-            "Of 100 telescopes drawn, half reach 10 um and 95 % no light, where the design has 9 um; 10 of them have "
-            "no light; T0 costs most.",
+            "Of 100 telescopes drawn, half reach 10 um and 95 % no light, where the design has 9 um; 10 without "
+            "light; T0 costs most.",
         ),
         (tolerance_summary(lost=100, offenders=()), "No light arrives in any of 100 telescopes drawn."),
+        (
+            tolerance_summary(1),
+            "The one telescope drawn reaches 10 um, where the design has 9 um; T0 costs most.",
+        ),
         # No tolerance changes anything.
         (
             tolerance_summary(offenders=[(9.0, 9.0)]),

@@ -122,7 +122,7 @@ def test_the_command_leaves_model_picture_and_table(stars, tmp_path, monkeypatch
     stamps[2, 5, 5] = np.nan
     stamps[3, 14:19, 14:19] = -1e30
     Table({"x": stars.positions[:, 0], "y": stars.positions[:, 1], "stamp": stamps}).write("stars.fits")
-    assert main(["model", "stars.fits", "--json"]) == 0
+    assert main(["model", "stars.fits", "--json", "--picture", "stars_psf.png"]) == 0
     found = json.loads(capsys.readouterr().out)
     # Without the faint one, and the one whose core is masked.
     assert (found["stars"], found["used"]) == (COUNT, COUNT - 2)
