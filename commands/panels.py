@@ -15,7 +15,7 @@ PANELS = {
     "design-report",
     "Optimise, tolerance, sweep": "optimize operands sensitivity tolerance sweep baseline check",
     "Camera and alignment": "camera shim donuts align",
-    "Files": "info convert new validate schema config",
+    "Files": "info convert new validate schema config warm-up",
 }
 
 
