@@ -23,9 +23,9 @@ FIELDS = pachon.fields_at(TELESCOPE, LIFTED.camera.centers[[94, 10]] + 1e-3)
         lambda t, **on: pachon.spots(t, FIELDS, n_pupil=5, **on).rms_radius,
         lambda t, **on: pachon.through_focus(t, FIELDS, defocus=[0.0, 1e-5], n_pupil=5, **on).rms_radius,
         lambda t, **on: pachon.strehl(t, FIELDS[:1], from_psf=False, n_pupil=5, **on).rms_wavefront,
-        lambda t, **on: pachon.encircled_energy(
-            t, FIELDS, kind="geometric", n_pupil=200, radii=[5e-6, 2e-5], **on
-        ).fraction,
+        lambda t, **on: (
+            pachon.encircled_energy(t, FIELDS, kind="geometric", n_pupil=200, radii=[5e-6, 2e-5], **on).fraction
+        ),
     ],
 )
 def test_a_focal_plane_that_is_lifted_is_a_detector_that_is_moved(analysis):

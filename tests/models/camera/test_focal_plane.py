@@ -383,7 +383,9 @@ def test_scaled_terms_are_the_draw_of_a_scaled_budget():
     np.testing.assert_allclose(scaled.waves, drawn.waves, rtol=0, atol=1e-12)
     assert scaled.budget == drawn.budget
     # Heights are linear in the factors, and a factor is of the heights as they are now.
-    np.testing.assert_allclose(scaled.scaled({"raft": 0.5}).polynomial, plane.scaled(factors | {"raft": 1.0}).polynomial)
+    np.testing.assert_allclose(
+        scaled.scaled({"raft": 0.5}).polynomial, plane.scaled(factors | {"raft": 1.0}).polynomial
+    )
     assert plane.with_terms("raft").scaled({"ccd": 3.0}).terms == ("raft",)
 
 
