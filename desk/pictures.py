@@ -35,15 +35,13 @@ _HEIGHT = 330
 class Picture:
     """A figure, and the state of a theme."""
 
-    def __init__(
-        self, name: str, title: str, x_label: str, y_label: str, *, square: bool = True, tools: str = ""
-    ) -> None:
+    def __init__(self, name: str, title: str, x_label: str, y_label: str, *, square: bool = True) -> None:
         self.figure = figure(
             name=name,
             title=title,
             height=_HEIGHT,
             sizing_mode="stretch_width",
-            tools=f"pan,wheel_zoom,box_zoom,reset,save{',' * bool(tools)}{tools}",
+            tools="pan,wheel_zoom,box_zoom,reset,save",
             active_scroll=None,
             match_aspect=square,
             x_axis_label=x_label,
@@ -52,6 +50,7 @@ class Picture:
             output_backend="canvas",
         )
         self.figure.toolbar.logo = None
+        self.figure.xaxis.ticker.desired_num_ticks = 5
         self.figure.toolbar.autohide = True
         self.bars: list[ColorBar] = []
 
@@ -97,8 +96,8 @@ class SectionPicture(Picture):
         super().__init__("section", "Layout, section x = 0", "z [m]", "y [m]")
         self._lenses, self._surfaces, self._rays = (ColumnDataSource({"xs": [], "ys": []}) for _ in range(3))
         self.figure.multi_line("xs", "ys", source=self._rays, color="color", alpha=0.45, line_width=0.8)
-        glass = self.figure.patches("xs", "ys", source=self._lenses, color=BLUE, alpha=0.3)
-        self._lines = self.figure.multi_line("xs", "ys", source=self._surfaces, line_width=2.2)
+        glass = self.figure.patches("xs", "ys", source=self._lenses, color=BLUE, alpha=0.35)
+        self._lines = self.figure.multi_line("xs", "ys", source=self._surfaces, line_width="width")
         tips = [("", "@name"), ("", "@text")]
         self.figure.add_tools(HoverTool(renderers=[glass, self._lines], tooltips=tips, line_policy="interp"))
 
@@ -111,6 +110,7 @@ class SectionPicture(Picture):
                 "ys": [piece.y_m for piece in pieces],
                 "name": [piece.name for piece in pieces],
                 "text": [piece.text for piece in pieces],
+                "width": [0.8 if "refract" in piece.text else 2.4 for piece in pieces],
             }
         colors = [(GREY, ORANGE, GREEN)[i % 3] for i in view.ray_fields]
         self._rays.data = {"xs": [z for z, _ in view.rays], "ys": [y for _, y in view.rays], "color": colors}
@@ -215,22 +215,24 @@ class ZernikePicture(Picture):
         self.source = ColumnDataSource({"j": [], "c": [], "a": []})
         self.figure.vbar("j", 0.8, "c", source=self.source, color=BLUE, legend_label="now")
         mark = {"fill_alpha": 0.0, "line_color": ORANGE, "line_width": 1.8, "size": 9}
-        self.figure.scatter("j", "a", source=self.source, marker="diamond", legend_label="A", **mark)
+        self.figure.scatter("j", "a", source=self.source, marker="diamond", legend_label="A, pinned", **mark)
+        self.figure.legend.items[1].visible = False
         self.figure.legend.orientation, self.figure.legend.location = "horizontal", "top_right"
-        self.figure.xaxis.ticker = list(range(4, 23, 2))
+        self.figure.xaxis.ticker = list(range(4, 23, 3))
         self.figure.add_tools(HoverTool(tooltips=[("Z", "@j"), ("now", "@c{0.0} nm"), ("A", "@a{0.0} nm")]))
 
     def show(self, view: OpdView, reference: OpdView | None) -> None:
         """Draw coefficients."""
-        compared = view if reference is None else reference
-        self.source.data = {"j": view.noll, "c": view.zernikes_nm, "a": compared.zernikes_nm}
+        compared = np.full(len(view.noll), np.nan) if reference is None else reference.zernikes_nm
+        self.source.data = {"j": view.noll, "c": view.zernikes_nm, "a": compared}
+        self.figure.legend.items[1].visible = reference is not None
 
 
 class ImagePicture(MapPicture):
     """An image of the star, over its peak on a square root scale."""
 
     def __init__(self, name: str, title: str) -> None:
-        super().__init__(name, title, ("x [arcsec]", "y [arcsec]"), "root of part of peak", Viridis256)
+        super().__init__(name, title, ("x [arcsec]", "y [arcsec]"), "sqrt(image / peak)", Viridis256)
 
     def show(self, image: np.ndarray, pixel_arcsec: float) -> None:
         """Draw an image."""
@@ -245,7 +247,11 @@ class EnergyPicture(Picture):
     def __init__(self) -> None:
         super().__init__("energy", "Encircled energy at the star", "radius [arcsec]", "light within [%]", square=False)
         self._curves = {}
-        lines = (("optics alone", BLUE, "solid"), ("with the atmosphere", GREEN, "solid"), ("A", ORANGE, "dashed"))
+        lines = (
+            ("optics alone", BLUE, "solid"),
+            ("with the atmosphere", GREEN, "solid"),
+            ("A, pinned", ORANGE, "dashed"),
+        )
         for label, color, dash in lines:
             self._curves[label] = ColumnDataSource({"x": [], "y": []})
             style = {"color": color, "line_dash": dash, "line_width": 2, "legend_label": label}
@@ -263,7 +269,10 @@ class EnergyPicture(Picture):
         if reference is not None:
             compared = reference.optics_energy if reference.seen_energy is None else reference.seen_energy
         radius = view.radius_arcsec if reference is None else reference.radius_arcsec
-        self._curves["A"].data = _curve(radius, compared)
+        self._curves["A, pinned"].data = _curve(radius, compared)
+        shown = (True, view.seen_energy is not None, compared is not None)
+        for item, visible in zip(self.figure.legend.items, shown, strict=True):
+            item.visible = visible
 
 
 #: What may stand behind the whiskers.
@@ -307,7 +316,7 @@ class WhiskersPicture(Picture):
         x0, y0 = -self._extent, -1.12 * self._extent
         self._key.data = {"x0": [x0], "y0": [y0], "x1": [x0 + length * key], "y1": [y0]}
         self._key_text.data = {"x": [x0], "y": [y0], "text": [f"e = {100 * key:.3g} %"]}
-        self.figure.title.text = f"Whiskers: {view.method}"
+        self.figure.title.text = view.method
         of_heights = self.background == BACKGROUNDS[0]
         values = view.fwhm_arcsec if self.background == BACKGROUNDS[1] else 100.0 * view.e
         self._tiles.data = {

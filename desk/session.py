@@ -12,12 +12,24 @@ import numpy as np
 from bokeh.document import Document
 from bokeh.events import DocumentReady
 from bokeh.layouts import column, row
-from bokeh.models import Button, CustomJS, Div, FileInput, Select, Slider, Spinner, TextAreaInput, Toggle
+from bokeh.models import (
+    Button,
+    CustomJS,
+    Div,
+    FileInput,
+    Select,
+    Slider,
+    Spinner,
+    TextAreaInput,
+    Toggle,
+)
+from bokeh.models.widgets import Widget
 
 from ..core.errors import PachonError
 from .bench import Bench, Control
 from .pictures import (
     BACKGROUNDS,
+    ORANGE,
     EnergyPicture,
     ImagePicture,
     OpdPicture,
@@ -50,6 +62,18 @@ _LIFT = 50.0
 _MOST_BYTES = 10**6
 _FAST = (OpdView, SpotsView, WhiskersView)
 _LIFTS = "Heights of CCDs"
+#: Colours of widgets, whose shadow trees the page's own rules do not reach.
+_STYLE = """
+:host { color: var(--text); }
+.bk-input, .bk-btn, .noUi-handle { background-color: var(--card) !important; color: var(--text) !important; }
+.bk-input, .bk-btn { border: 1px solid var(--line) !important; }
+.bk-input { padding: 2px 6px; height: 28px; min-height: 28px; }
+.bk-btn { padding: 4px 8px; }
+.bk-btn:hover, .bk-btn.bk-active { border-color: var(--accent) !important; }
+.bk-spin-btn { background-color: var(--card) !important; }
+.noUi-target { background: var(--line); }
+:host(:focus-within) .noUi-handle:focus, .bk-btn:focus-visible, .bk-input:focus { outline: 2px solid var(--accent); }
+"""
 #: Downloads the text of a hidden field under a name.
 _DOWNLOAD = """
 const link = document.createElement('a');
@@ -151,9 +175,8 @@ class Session:
         if self.bench.is_lsst:
             hide = _button("Misalign M2, hidden", self.misalign, 150)
             buttons.append(row(hide, _button("Reveal", self.reveal)))
-        save = row(
-            _download("Save state", self.state_text, "desk.yaml"), _download("As Python", self.python, "desk.py")
-        )
+        saved = _download("Save state", self.state_text, "desk.yaml")
+        save = row(saved, _download("As Python", self.python, "desk.py"))
         parts = [self.group, self.sliders, *buttons, self.background, self.density, save, load]
         self.sidebar = column(*parts, self.state_text, self.python, name="sidebar", sizing_mode="stretch_width")
 
@@ -162,6 +185,8 @@ class Session:
             rows = [self._row(control) for control in self.bench.controls if control.group == group]
             if group == _LIFTS:
                 rows += self._lift_rows()
+            for part in rows:
+                _colour(part)
             self._groups[group] = rows
         self._sync()
         self.sliders.children = self._groups[group]
@@ -170,13 +195,13 @@ class Session:
         low, high = control.low, control.high
         label = f"{control.label} [{control.unit}]"
         format_text = "0[.]0000" if control.step < 0.01 else "0[.]00"
-        value = self.history.state.value(control.key)
-        shown = {"sizing_mode": "stretch_width", "min_width": 120, "format": format_text}
+        value = self.history.state.value(self._key(control.key))
+        shown = {"sizing_mode": "stretch_width", "min_width": 120, "format": format_text, "margin": (2, 5, 0, 5)}
         slider = Slider(title=label, start=low, end=high, step=control.step, value=value, **shown)
-        number = Spinner(title=control.unit, value=value, step=control.step, width=92, css_classes=["number"])
+        number = Spinner(title="", value=value, step=control.step, width=88, margin=(14, 5, 0, 5), name=control.key)
         self._sliders[control.key] = slider, number
-        for widget in (slider, number):
-            widget.on_change("value", lambda attribute, old, new: self.set_value(control.key, new))
+        slider.on_change("value", lambda attribute, old, new: self.set_value(control.key, new))
+        number.on_change("value", lambda attribute, old, new: self.set_value(control.key, new, drag=False))
         slider.on_change("value_throttled", lambda attribute, old, new: self.history.settle())
         return row(slider, number, sizing_mode="stretch_width")
 
@@ -210,10 +235,12 @@ class Session:
 
     # Changes
 
-    def set_value(self, key: str, value: float | None) -> None:
-        """Set the number of a control."""
+    def set_value(self, key: str, value: float | None, *, drag: bool = True) -> None:
+        """Set the number of a control; all of a drag are one step to undo."""
         if self._syncing or value is None:
             return
+        if not drag:
+            self.history.settle()
         key = self._key(key)
         try:
             state = self.history.state.with_value(key, value)
@@ -384,12 +411,12 @@ class Session:
 
     def _show_numbers(self) -> None:
         now, then = (numbers(*(v.get(k) for k in _NUMBERED)) for v in (self.views, self.compared))
-        head = "<tr><th></th><th>now</th>" + "<th>A</th>" * bool(then) + "<th></th></tr>"
-        rows = []
+        boxes = []
         for name, (value, unit) in now.items():
-            compared = f"<td>{then[name][0]:.4g}</td>" if name in then else "<td></td>" * bool(then)
-            rows.append(f"<tr><td>{escape(name)}</td><td>{value:.4g}</td>{compared}<td>{escape(unit)}</td></tr>")
-        self.table.text = f"<table>{head}{''.join(rows)}</table>"
+            compared = f'<div style="color:{ORANGE}">A {then[name][0]:.4g} {unit}</div>' if name in then else ""
+            number = f'<b style="font-size:17px">{value:.4g}</b> {escape(unit)}'
+            boxes.append(f'<div><div style="opacity:.75">{escape(name)}</div>{number}{compared}</div>')
+        self.table.text = f'<div style="display:flex;flex-wrap:wrap;gap:6px 22px">{"".join(boxes)}</div>'
 
     def _say(self, message: PachonError | str, *, error: bool = True) -> None:
         text = escape(" ".join(str(message).split()))
@@ -398,9 +425,16 @@ class Session:
 
     def add_to(self, document: Document) -> None:
         """Add the roots to the document of a page."""
+        _colour(self.sidebar)
         for root in (self.sidebar, self.status, self.table, *(picture.figure for picture in self.pictures)):
             document.add_root(root)
         document.js_on_event(DocumentReady, CustomJS(args={"toggle": self.theme_toggle}, code=_FIRST_THEME))
+
+
+def _colour(part: Any) -> None:
+    """Colour the widgets of a part of the page."""
+    for widget in part.select({"type": Widget}):
+        widget.stylesheets = [_STYLE]
 
 
 _NUMBERED = (SpotsView, OpdView, WhiskersView, ImagesView)

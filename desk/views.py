@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -39,6 +38,8 @@ _JMAX = 22
 _HEIGHTS = 100
 #: Pixels along a side of PSFs; radii of encircled energy.
 _PIXELS = 41
+#: Pixels along a side of stamps of the camera.
+_STAMP = 27
 _RADII = 61
 SITE = "cerro_pachon"
 
@@ -183,7 +184,7 @@ def _ray_whiskers(scene: Scene, places: np.ndarray, star_fields: np.ndarray) -> 
         root = np.sqrt(np.maximum(xx * yy - xy**2, 0.0))
         norm = xx + yy + 2.0 * root
         e1, e2 = (xx - yy) / norm, 2.0 * xy / norm
-    method = "second moments of rays" + " and seeing" * (air > 0)
+    method = "Whiskers: second moments of rays" + " and seeing" * (air > 0)
     return WhiskersView(*(places.T * 1e3), e1, e2, FWHM * np.sqrt(root), method)
 
 
@@ -198,17 +199,14 @@ def _weighted_whiskers(scene: Scene, places: np.ndarray, star_fields: np.ndarray
     )
     air = scene.atmosphere is not None
     e1, e2, size = (moments.g1, moments.g2, moments.sigma) if air else (moments.e1, moments.e2, moments.size)
-    method = "adaptive moments, with the atmosphere" if air else "moments of the optics, weight of 0.3 arcsec"
+    method = "Whiskers: adaptive moments" if air else "Whiskers: optics, weight of 0.3 arcsec"
     return WhiskersView(*(places.T * 1e3), e1, e2, FWHM * size / ARCSEC, method)
 
 
-def stamps_of(scene: Scene, size: int = _PIXELS, finer: int = 1) -> Stamps:
-    """Return stamps with the pixels of the camera, or finer ones without charge diffusion."""
+def stamps_of(scene: Scene) -> Stamps:
+    """Return stamps with the pixels of the camera; without one of 10 um."""
     camera = scene.bench.camera
-    if finer > 1 or camera is None:
-        pixel = (camera.pixel_size if camera is not None else 10e-6) / finer
-        return Stamps(size=size, pixel_size=pixel, diffusion=0.0 if camera is None or finer > 1 else 4e-6)
-    return Stamps.of_camera(camera, size=size)
+    return Stamps(size=_STAMP) if camera is None else Stamps.of_camera(camera, size=_STAMP)
 
 
 @dataclass(frozen=True)
@@ -351,8 +349,3 @@ def numbers(
 
 def _median(values: np.ndarray) -> float:
     return float(np.nanmedian(values)) if np.isfinite(values).any() else math.nan
-
-
-def plain(view: Any) -> dict[str, Any]:
-    """Return the arrays of a view by name."""
-    return {f.name: getattr(view, f.name) for f in fields(view)}

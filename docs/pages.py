@@ -85,9 +85,7 @@ def api_page(layer: str) -> str:
     """Return the list of a layer's public names as MyST, each with a page that autosummary makes."""
     title, text = LAYERS[layer]
     names = "\n".join(f"   pachon.{name}" for name in public_names()[layer])
-    return (
-        f"# {title}\n\n{text}\n\n```{{eval-rst}}\n.. autosummary::\n   :toctree: .\n   :nosignatures:\n\n{names}\n```\n"
-    )
+    return f"# {title}\n\n{text}\n\n```{{eval-rst}}\n.. autosummary::\n   :toctree: .\n   :nosignatures:\n\n{names}\n```\n"
 
 
 def api_index() -> str:
@@ -138,9 +136,7 @@ def _command_lines(name: str, command: object) -> list[str]:
     text = re.sub(r"\n\n((?: {4}.*\n?)+)", lambda m: f"\n\n```text\n{dedent(m[1]).rstrip()}\n```\n", text)
     rows = [row for parameter in command.params if (row := _option_row(parameter))]
     table = ["| option | meaning |", "|---|---|", *rows, ""] if rows else []
-    below = [
-        line for key, sub in getattr(command, "commands", {}).items() for line in _command_lines(f"{name} {key}", sub)
-    ]
+    below = [line for key, sub in getattr(command, "commands", {}).items() for line in _command_lines(f"{name} {key}", sub)]
     return [f"# {name}", "", text, "", *table, *below]
 
 

@@ -150,9 +150,9 @@ def huygens_psf(
 ) -> DiffractionPsf:
     """Make diffraction images by summing the plane wave of every ray at every pixel.
 
-    Parameters and errors are those of :func:`fft_psf`, but for `focal_plane`, which a request holds, and for `sampling`
-    and `n_pupil`, which are those of :meth:`pachon.Request.of`: by default a square lattice, 160 across. Gauss quadrature needs far fewer points where
-    nothing is vignetted.
+    Parameters and errors are those of :func:`fft_psf`, but for `focal_plane`, which a request holds, and for
+    `sampling` and `n_pupil`, which are those of :meth:`pachon.Request.of`: by default a square lattice, 160 across.
+    Gauss quadrature needs far fewer points where nothing is vignetted.
     """
     request = Request.of(
         telescope,
