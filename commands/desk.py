@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -68,8 +69,9 @@ def desk_command(
     server, address = open_server(lambda document: show_in(Session(bench, state, document), document), port)
     if f":{port}/" not in address:
         print_line(f"port {port} is taken; the next free one is used", error=True)
-    print_line(f"desk of {bench.nominal.name}: {address} (Ctrl-C ends it)")
-    serve(server, address, browser=browser)
+    with suppress(KeyboardInterrupt):
+        print_line(f"desk of {bench.nominal.name}: {address} (Ctrl-C ends it)")
+        serve(server, address, browser=browser)
 
 
 def _opened(model: str) -> tuple[Bench, DeskState]:
@@ -85,8 +87,9 @@ def _opened(model: str) -> tuple[Bench, DeskState]:
         bench = Bench(model)
         return bench, bench.start
     state = DeskState.from_file(path)
-    if Path(state.model).suffix and not Path(state.model).is_absolute():
-        state = replace(state, model=str(path.parent / state.model))
+    beside = path.parent / state.model
+    if beside.is_file():
+        state = replace(state, model=str(beside))
     with error_context(file=path):
         bench = Bench(state.model)
         return bench, bench.check(state)

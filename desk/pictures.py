@@ -313,7 +313,7 @@ class WhiskersPicture(Picture):
         for source, shapes in ((self._whiskers, view), (self._compared, compared)):
             same = shapes is not None
             source.data = dict(zip(("x0", "y0", "x1", "y1"), shapes.ends(length), strict=True)) if same else _NO_ENDS
-        x0, y0 = -self._extent, -1.12 * self._extent
+        x0, y0 = -self._extent, -1.3 * self._extent
         self._key.data = {"x0": [x0], "y0": [y0], "x1": [x0 + length * key], "y1": [y0]}
         self._key_text.data = {"x": [x0], "y": [y0], "text": [f"e = {100 * key:.3g} %"]}
         self.figure.title.text = view.method

@@ -32,6 +32,7 @@ def open_server(show: Callable[[Document], None], port: int = PORT, token: str |
     """
     path = f"/{token or secrets.token_urlsafe(24)}"
     logging.getLogger("bokeh").setLevel(logging.ERROR)
+    logging.getLogger("tornado.application").addFilter(_is_no_early_farewell)
     for number in range(port, min(port + _PORTS, 65536)):
         try:
             server = Server(
@@ -62,3 +63,8 @@ def serve(server: Server, address: str, *, browser: bool) -> None:
         server.io_loop.start()
     finally:
         server.stop()
+
+
+def _is_no_early_farewell(record: logging.LogRecord) -> bool:
+    """Leave out Bokeh's assertion about a page that is closed before it has opened its session."""
+    return not (record.exc_info and record.exc_info[0] is AssertionError)

@@ -6,6 +6,7 @@ import base64
 import binascii
 from collections.abc import Callable
 from html import escape
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,10 @@ from .views import (
 
 #: Range of the lift of one CCD or raft [um].
 _LIFT = 50.0
+#: Time for further changes to arrive before all are drawn at once [ms].
+_PAUSE = 15
+#: Longest time between two changes of one drag [s].
+_DRAG = 2.0
 #: Largest file of a state that is read [bytes].
 _MOST_BYTES = 10**6
 _FAST = (OpdView, SpotsView, WhiskersView)
@@ -70,7 +75,9 @@ _STYLE = """
 .bk-input { padding: 2px 6px; height: 28px; min-height: 28px; }
 .bk-btn { padding: 4px 8px; }
 .bk-btn:hover, .bk-btn.bk-active { border-color: var(--accent) !important; }
-.bk-spin-btn { background-color: var(--card) !important; }
+select.bk-input { appearance: auto; background-image: none; }
+input[type="file"] { height: auto !important; }
+.bk-spin-btn { filter: var(--invert); }
 .noUi-target { background: var(--line); }
 :host(:focus-within) .noUi-handle:focus, .bk-btn:focus-visible, .bk-input:focus { outline: 2px solid var(--accent); }
 """
@@ -102,6 +109,7 @@ class Session:
         self.compared: dict[type, Any] = {}
         self.redraws = 0
         self._waiting = self._syncing = False
+        self._changed = 0.0
         self._changed_geometry = self._changed_heights = True
         self._sliders: dict[str, tuple[Slider, Spinner]] = {}
         self._groups: dict[str, Any] = {}
@@ -144,7 +152,7 @@ class Session:
     # Widgets
 
     def _make_widgets(self) -> None:
-        self.status = Div(text="", name="status", sizing_mode="stretch_width", css_classes=["status"])
+        self.status = Div(text="", visible=False, name="status", sizing_mode="stretch_width", css_classes=["status"])
         self.table = Div(text="", name="numbers", sizing_mode="stretch_width")
         groups = list(dict.fromkeys(control.group for control in self.bench.controls))
         self.group = Select(title="Controls", value=groups[0], options=groups, sizing_mode="stretch_width")
@@ -202,7 +210,6 @@ class Session:
         self._sliders[control.key] = slider, number
         slider.on_change("value", lambda attribute, old, new: self.set_value(control.key, new))
         number.on_change("value", lambda attribute, old, new: self.set_value(control.key, new, drag=False))
-        slider.on_change("value_throttled", lambda attribute, old, new: self.history.settle())
         return row(slider, number, sizing_mode="stretch_width")
 
     def _lift_rows(self) -> list[Any]:
@@ -239,8 +246,9 @@ class Session:
         """Set the number of a control; all of a drag are one step to undo."""
         if self._syncing or value is None:
             return
-        if not drag:
+        if not drag or monotonic() - self._changed > _DRAG:
             self.history.settle()
+        self._changed = monotonic()
         key = self._key(key)
         try:
             state = self.history.state.with_value(key, value)
@@ -335,13 +343,13 @@ class Session:
             self.redraw_slow()
         elif not self._waiting:
             self._waiting = True
-            self.document.add_next_tick_callback(self._draw_scheduled)
+            self.document.add_timeout_callback(self._draw_scheduled, _PAUSE)
 
     def _draw_scheduled(self) -> None:
         self._waiting = False
         self.redraw_fast()
         if self.document is not None:
-            self.document.add_next_tick_callback(self._draw_rest)
+            self.document.add_timeout_callback(self._draw_rest, _PAUSE)
 
     def _draw_rest(self) -> None:
         # A change that has come in between is drawn first.
@@ -421,6 +429,7 @@ class Session:
     def _say(self, message: PachonError | str, *, error: bool = True) -> None:
         text = escape(" ".join(str(message).split()))
         color = "#c2410c" if error else "#16a37a"
+        self.status.visible = bool(text)
         self.status.text = text and f'<span role="status" style="color:{color};font-weight:600">{text}</span>'
 
     def add_to(self, document: Document) -> None:
