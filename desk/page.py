@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from bokeh.core.templates import get_env
 from bokeh.document import Document
 from bokeh.embed import file_html
 from bokeh.resources import INLINE
-from jinja2 import Environment, FileSystemLoader, Template
+from jinja2 import ChoiceLoader, Environment, FileSystemLoader, Template
 
 from ..core.files import write_bytes
 from .session import Session
@@ -18,14 +19,9 @@ _TEMPLATES = Path(__file__).parent / "templates"
 
 def template() -> Template:
     """Return the template of a page. What it shows is escaped; Bokeh's parts are marked as safe."""
-    from bokeh.core.templates import get_env
-
     # Bokeh's own base page stands beside ours.
-    loaders = get_env().loader
-    from jinja2 import ChoiceLoader
-
-    environment = Environment(loader=ChoiceLoader([FileSystemLoader(_TEMPLATES), loaders]), autoescape=True)
-    return environment.get_template("desk.html")
+    loader = ChoiceLoader([FileSystemLoader(_TEMPLATES), get_env().loader])
+    return Environment(loader=loader, autoescape=True).get_template("desk.html")
 
 
 def page_names(session: Session, *, live: bool) -> dict[str, Any]:
@@ -54,5 +50,12 @@ def export_page(session: Session, path: Path) -> None:
     names = page_names(session, live=False)
     names["picture_names"] = [str(figure.name) for figure in pictures]
     roots = [session.status, session.table, *pictures]
-    text = file_html(roots, INLINE, title=names.pop("title"), template=template(), template_variables=names)
+    text = file_html(
+        roots,
+        INLINE,
+        title=names.pop("title"),
+        template=template(),
+        template_variables=names,
+        suppress_callback_warning=True,
+    )
     write_bytes(path, text.encode("utf-8"))

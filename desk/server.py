@@ -31,7 +31,10 @@ def open_server(show: Callable[[Document], None], port: int = PORT, token: str |
     gets no connection.
     """
     path = f"/{token or secrets.token_urlsafe(24)}"
-    logging.getLogger("bokeh").setLevel(logging.ERROR)
+    # What is refused is no error of this program.
+    for name, level in {"bokeh": logging.ERROR, "bokeh.server.views.ws": logging.CRITICAL}.items():
+        logging.getLogger(name).setLevel(level)
+    logging.getLogger("tornado.access").setLevel(logging.ERROR)
     logging.getLogger("tornado.application").addFilter(_is_no_early_farewell)
     for number in range(port, min(port + _PORTS, 65536)):
         try:
