@@ -171,10 +171,10 @@ class Bench:
         return self.freedoms.apply(self.nominal, state.total_optics)
 
     def focal_plane(self, state: DeskState) -> FocalPlane | None:
-        """Return the CCDs of a state; None without a camera."""
-        if self.camera is None:
+        """Return the CCDs of a state; None where they are on the nominal detector, or there are none."""
+        if self.camera is None or not (state.heights or state.lifts or self.camera.placement is not None):
             return None
-        plane = self._flat
+        plane = self.flat
         if state.heights:
             plane = self._drawn(state.seed).scaled(height_factors(state.heights))
         for name, lift in state.lifts.items():
@@ -182,7 +182,10 @@ class Bench:
         return plane
 
     @cached_property
-    def _flat(self) -> FocalPlane:
+    def flat(self) -> FocalPlane:
+        """Flat CCDs of the camera."""
+        if self.camera is None:
+            raise DomainError(f"{self.model}: expected a telescope with a camera")
         return FocalPlane.flat(self.camera)
 
     def _drawn(self, seed: int) -> FocalPlane:

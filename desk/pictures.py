@@ -307,8 +307,8 @@ class WhiskersPicture(Picture):
 
     def show(self, view: WhiskersView, heights: HeightsView | None, compared: WhiskersView | None) -> None:
         """Draw whiskers, those of the state that is compared to below them."""
-        largest = max(float(np.nanquantile(view.e, 0.9)) if np.isfinite(view.e).any() else 0.0, 2e-3)
-        key = _round_up(largest)
+        drawn = [shapes.e for shapes in (view, compared) if shapes is not None and np.isfinite(shapes.e).any()]
+        key = _round_up(max([2e-3, *(float(np.nanquantile(e, 0.9)) for e in drawn)]))
         length = 0.11 * self._extent / key
         for source, shapes in ((self._whiskers, view), (self._compared, compared)):
             same = shapes is not None

@@ -19,7 +19,7 @@ def python_text(bench: Bench, state: DeskState) -> str:
     lines.append(f"wavelength = {state.wavelength_nm!r} * 1e-9")
     lines.append(f"star = np.deg2rad({list(state.field_deg)!r})")
     lines.append("focal_plane = None")
-    if bench.camera is not None:
+    if bench.focal_plane(state) is not None:
         lines.append("focal_plane = pachon.FocalPlane.flat(nominal.camera)")
         if state.heights:
             factors = height_factors(state.heights)

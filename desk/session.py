@@ -368,8 +368,8 @@ class Session:
             self._sync()
             return
         self._update(OpdView, lambda: opd_view(scene))
-        if self._changed_heights and scene.focal_plane is not None:
-            self._update(HeightsView, lambda: heights_view(scene.focal_plane))
+        if self._changed_heights and self.bench.camera is not None:
+            self._update(HeightsView, lambda: heights_view(scene.focal_plane or self.bench.flat))
             self._changed_heights = False
         self._update(WhiskersView, lambda: whiskers_view(scene))
         if SpotsView in self.views:
