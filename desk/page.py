@@ -12,6 +12,7 @@ from bokeh.resources import INLINE
 from jinja2 import ChoiceLoader, Environment, FileSystemLoader, Template
 
 from ..core.files import write_bytes
+from .run_session import RunSession
 from .session import Session
 
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -24,27 +25,27 @@ def template() -> Template:
     return Environment(loader=loader, autoescape=True).get_template("desk.html")
 
 
-def page_names(session: Session, *, live: bool) -> dict[str, Any]:
+def page_names(session: Session | RunSession, *, live: bool) -> dict[str, Any]:
     """Return what the template fills in."""
     names = [str(picture.figure.name) for picture in session.pictures]
     return {
-        "title": f"{session.bench.nominal.name}: desk",
-        "subtitle": session.bench.nominal.description,
+        "title": session.title,
+        "subtitle": session.subtitle,
         "picture_names": names,
         "root_names": ["sidebar"] if live else [],
-        "state_text": "" if live else session.history.state.to_yaml(),
+        "state_text": "" if live else session.state_words,
     }
 
 
-def show_in(session: Session, document: Document) -> None:
+def show_in(session: Session | RunSession, document: Document) -> None:
     """Make a document the page of a session."""
     document.template = template()
-    document.title = f"{session.bench.nominal.name}: desk"
+    document.title = session.title
     document.template_variables.update(page_names(session, live=True))
     session.add_to(document)
 
 
-def export_page(session: Session, path: Path) -> None:
+def export_page(session: Session | RunSession, path: Path) -> None:
     """Write the pictures and numbers of a session as one page that needs no network."""
     pictures = [picture.figure for picture in session.pictures if picture.figure.visible]
     names = page_names(session, live=False)

@@ -35,7 +35,9 @@ _HEIGHT = 330
 class Picture:
     """A figure, and the state of a theme."""
 
-    def __init__(self, name: str, title: str, x_label: str, y_label: str, *, square: bool = True) -> None:
+    def __init__(
+        self, name: str, title: str, x_label: str, y_label: str, *, square: bool = True, log_x: bool = False
+    ) -> None:
         self.figure = figure(
             name=name,
             title=title,
@@ -44,6 +46,7 @@ class Picture:
             tools="pan,wheel_zoom,box_zoom,reset,save",
             active_scroll=None,
             match_aspect=square,
+            x_axis_type="log" if log_x else "linear",
             x_axis_label=x_label,
             y_axis_label=y_label,
             min_border=4,
@@ -350,6 +353,11 @@ class WhiskersPicture(Picture):
 
 
 _NO_ENDS: dict[str, list[float]] = {"x0": [], "y0": [], "x1": [], "y1": []}
+
+
+def diverging_palette() -> list[str]:
+    """Return colours of values about zero."""
+    return list(_DIVERGING)
 
 
 def _curve(radius: np.ndarray, fraction: np.ndarray | None) -> dict[str, Any]:

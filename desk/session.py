@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import binascii
 from collections.abc import Callable
-from html import escape
 from time import monotonic
 from typing import Any
 
@@ -16,21 +15,17 @@ from bokeh.layouts import column, row
 from bokeh.models import (
     Button,
     CustomJS,
-    Div,
     FileInput,
     Select,
     Slider,
     Spinner,
     TextAreaInput,
-    Toggle,
 )
-from bokeh.models.widgets import Widget
 
 from ..core.errors import PachonError
 from .bench import Bench, Control
 from .pictures import (
     BACKGROUNDS,
-    ORANGE,
     EnergyPicture,
     ImagePicture,
     OpdPicture,
@@ -56,6 +51,7 @@ from .views import (
     spots_view,
     whiskers_view,
 )
+from .widgets import FIRST_THEME, colour, number_boxes, status_line, status_text, theme_toggle
 
 #: Range of the lift of one CCD or raft [um].
 _LIFT = 50.0
@@ -65,22 +61,7 @@ _PAUSE = 15
 _DRAG = 2.0
 #: Largest file of a state that is read [bytes].
 _MOST_BYTES = 10**6
-_FAST = (OpdView, SpotsView, WhiskersView)
 _LIFTS = "Heights of CCDs"
-#: Colours of widgets, whose shadow trees the page's own rules do not reach.
-_STYLE = """
-:host { color: var(--text); }
-.bk-input, .bk-btn, .noUi-handle { background-color: var(--card) !important; color: var(--text) !important; }
-.bk-input, .bk-btn { border: 1px solid var(--line) !important; }
-.bk-input { padding: 2px 6px; height: 28px; min-height: 28px; }
-.bk-btn { padding: 4px 8px; }
-.bk-btn:hover, .bk-btn.bk-active { border-color: var(--accent) !important; }
-select.bk-input { appearance: auto; background-image: none; }
-input[type="file"] { height: auto !important; }
-.bk-spin-btn { filter: var(--invert); }
-.noUi-target { background: var(--line); }
-:host(:focus-within) .noUi-handle:focus, .bk-btn:focus-visible, .bk-input:focus { outline: 2px solid var(--accent); }
-"""
 #: Downloads the text of a hidden field under a name.
 _DOWNLOAD = """
 const link = document.createElement('a');
@@ -89,14 +70,6 @@ link.download = name;
 link.click();
 URL.revokeObjectURL(link.href);
 """
-_THEME = """
-document.documentElement.classList.toggle('dark', toggle.active);
-toggle.label = toggle.active ? 'Light' : 'Dark';
-"""
-_FIRST_THEME = """
-const stated = new URLSearchParams(location.search).get('theme');
-toggle.active = stated ? stated == 'dark' : matchMedia('(prefers-color-scheme: dark)').matches;
-"""
 
 
 class Session:
@@ -104,6 +77,7 @@ class Session:
 
     def __init__(self, bench: Bench, state: DeskState | None = None, document: Document | None = None) -> None:
         self.bench, self.document = bench, document
+        self.title, self.subtitle = f"{bench.nominal.name}: desk", bench.nominal.description
         self.history = History(bench.check(state or bench.start))
         self.views: dict[type, Any] = {}
         self.compared: dict[type, Any] = {}
@@ -152,8 +126,7 @@ class Session:
     # Widgets
 
     def _make_widgets(self) -> None:
-        self.status = Div(text="", visible=False, name="status", sizing_mode="stretch_width", css_classes=["status"])
-        self.table = Div(text="", name="numbers", sizing_mode="stretch_width")
+        self.status, self.table = status_line()
         groups = list(dict.fromkeys(control.group for control in self.bench.controls))
         self.group = Select(title="Controls", value=groups[0], options=groups, sizing_mode="stretch_width")
         self.group.on_change("value", lambda attribute, old, new: self._show_group(new))
@@ -173,9 +146,7 @@ class Session:
         self.python = TextAreaInput(value="", visible=False)
         load = FileInput(accept=".yaml,.yml", title="Load a state (.yaml)", sizing_mode="stretch_width")
         load.on_change("value", lambda attribute, old, new: self._load(new))
-        self.theme_toggle = Toggle(label="Dark", width=70)
-        self.theme_toggle.on_change("active", lambda attribute, old, new: self.paint("dark" if new else "light"))
-        self.theme_toggle.js_on_change("active", CustomJS(args={"toggle": self.theme_toggle}, code=_THEME))
+        self.theme_toggle = theme_toggle(self.paint)
         buttons = [
             row(_button("Undo", self.undo), _button("Redo", self.redo), _button("Reset", self.reset)),
             row(_button("Pin as A", self.pin), _button("Back to A", self.back_to_pinned), self.theme_toggle),
@@ -194,7 +165,7 @@ class Session:
             if group == _LIFTS:
                 rows += self._lift_rows()
             for part in rows:
-                _colour(part)
+                colour(part)
             self._groups[group] = rows
         self._sync()
         self.sliders.children = self._groups[group]
@@ -334,6 +305,11 @@ class Session:
         self.whiskers.paint(self.theme)
         self._show_whiskers()
 
+    @property
+    def state_words(self) -> str:
+        """The state as a file of it has it."""
+        return self.history.state.to_yaml()
+
     # Drawing
 
     def schedule(self) -> None:
@@ -419,31 +395,17 @@ class Session:
 
     def _show_numbers(self) -> None:
         now, then = (numbers(*(v.get(k) for k in _NUMBERED)) for v in (self.views, self.compared))
-        boxes = []
-        for name, (value, unit) in now.items():
-            compared = f'<div style="color:{ORANGE}">A {then[name][0]:.4g} {unit}</div>' if name in then else ""
-            number = f'<b style="font-size:17px">{value:.4g}</b> {escape(unit)}'
-            boxes.append(f'<div><div style="opacity:.75">{escape(name)}</div>{number}{compared}</div>')
-        self.table.text = f'<div style="display:flex;flex-wrap:wrap;gap:6px 22px">{"".join(boxes)}</div>'
+        self.table.text = number_boxes(now, then)
 
     def _say(self, message: PachonError | str, *, error: bool = True) -> None:
-        text = escape(" ".join(str(message).split()))
-        color = "#c2410c" if error else "#16a37a"
-        self.status.visible = bool(text)
-        self.status.text = text and f'<span role="status" style="color:{color};font-weight:600">{text}</span>'
+        status_text(self.status, message, error=error)
 
     def add_to(self, document: Document) -> None:
         """Add the roots to the document of a page."""
-        _colour(self.sidebar)
+        colour(self.sidebar)
         for root in (self.sidebar, self.status, self.table, *(picture.figure for picture in self.pictures)):
             document.add_root(root)
-        document.js_on_event(DocumentReady, CustomJS(args={"toggle": self.theme_toggle}, code=_FIRST_THEME))
-
-
-def _colour(part: Any) -> None:
-    """Colour the widgets of a part of the page."""
-    for widget in part.select({"type": Widget}):
-        widget.stylesheets = [_STYLE]
+        document.js_on_event(DocumentReady, CustomJS(args={"toggle": self.theme_toggle}, code=FIRST_THEME))
 
 
 _NUMBERED = (SpotsView, OpdView, WhiskersView, ImagesView)
