@@ -32,6 +32,7 @@ def page_names(session: Session | RunSession, *, live: bool) -> dict[str, Any]:
         "title": session.title,
         "subtitle": session.subtitle,
         "picture_names": names,
+        "wide_names": ["stamps"],
         "root_names": ["sidebar"] if live else [],
         "state_text": "" if live else session.state_words,
     }

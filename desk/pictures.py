@@ -285,9 +285,13 @@ BACKGROUNDS = ("heights of CCDs", "FWHM", "ellipticity")
 class WhiskersPicture(Picture):
     """Whiskers over the focal plane, on a map of heights, FWHM or ellipticity."""
 
-    def __init__(self, extent_mm: float, tile_mm: float, *, heights: bool) -> None:
+    def __init__(
+        self, extent_mm: float, tile_mm: float, *, heights: bool, center_mm: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
         super().__init__("whiskers", "Whiskers", "detector x [mm]", "detector y [mm]")
-        self._extent, self._heights = extent_mm, heights
+        self._extent, self._center = extent_mm, center_mm
+        # Whiskers of many stars on one CCD lie beside their tiles too.
+        self._on_tiles = tile_mm > 0.05 * extent_mm
         self.background = BACKGROUNDS[0] if heights else BACKGROUNDS[1]
         self.mapper = LinearColorMapper(palette=_DIVERGING, low=-1.0, high=1.0, nan_color="rgba(0,0,0,0)")
         self._map = ColumnDataSource({"image": [np.zeros((2, 2))], "x": [0.0], "y": [0.0], "w": [1.0], "h": [1.0]})
@@ -316,7 +320,7 @@ class WhiskersPicture(Picture):
         for source, shapes in ((self._whiskers, view), (self._compared, compared)):
             same = shapes is not None
             source.data = dict(zip(("x0", "y0", "x1", "y1"), shapes.ends(length), strict=True)) if same else _NO_ENDS
-        x0, y0 = -self._extent, -1.3 * self._extent
+        x0, y0 = self._center[0] - self._extent, self._center[1] - 1.3 * self._extent
         self._key.data = {"x0": [x0], "y0": [y0], "x1": [x0 + length * key], "y1": [y0]}
         self._key_text.data = {"x": [x0], "y": [y0], "text": [f"e = {100 * key:.3g} %"]}
         self.figure.title.text = view.method
@@ -348,7 +352,8 @@ class WhiskersPicture(Picture):
     def paint(self, theme: str) -> None:
         """Colour all but the data by a theme; whiskers stand out from the middle of the scale."""
         super().paint(theme)
-        self._lines.glyph.line_color = "#000000" if self.background == BACKGROUNDS[0] else "#ffffff"
+        on_tiles = "#000000" if self.background == BACKGROUNDS[0] else "#ffffff"
+        self._lines.glyph.line_color = on_tiles if self._on_tiles else THEMES[theme]["text"]
         self._label.glyph.text_color = THEMES[theme]["text"]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from bokeh.document import Document
 from bokeh.events import DocumentReady, Tap
 from bokeh.layouts import column
-from bokeh.models import ColumnDataSource, CustomJS, RangeSlider, Select, Span, Whisker
+from bokeh.models import ColumnDataSource, CustomJS, FixedTicker, RangeSlider, Select, Span, Whisker
 
 from ..core.errors import PachonError
 from .pictures import BLUE, ORANGE, MapPicture, Picture, WhiskersPicture, diverging_palette
@@ -21,15 +21,15 @@ from .run_views import run_stamps as stamps_of
 from .run_views import run_whiskers as whiskers_of
 from .widgets import FIRST_THEME, colour, number_boxes, status_line, status_text, theme_toggle
 
-#: Side of the tile behind a star [mm].
-_TILE = 2.0
+#: Half of the side of a CCD, about [mm].
+_CCD = 22.0
 
 
 class StampsPicture(MapPicture):
     """Stamps of stars, the model at each and the difference, row by row."""
 
     def __init__(self) -> None:
-        axes = ("x [arcsec]", "star - model, model, star: y [arcsec]")
+        axes = ("x [arcsec]", "")
         super().__init__("stamps", "Stars of the CCD", axes, "part of the model's peak", diverging_palette())
 
     def show(self, view: StampsView, ccd: str) -> None:
@@ -39,7 +39,11 @@ class StampsPicture(MapPicture):
         image = np.sign(view.image) * np.sqrt(np.abs(view.image))
         self.source.data = {"image": [np.float32(image)], "x": [0.0], "y": [0.0], "w": [width], "h": [height]}
         self.bar.title = "signed sqrt(image / peak)"
-        self.figure.title.text = f"{ccd}: its {view.stars} brightest stars that are selected"
+        self.figure.title.text = f"{ccd}: the first {view.stars} stars of the selection"
+        places = [(row + 0.5) * view.side_arcsec for row in range(3)]
+        axis = self.figure.yaxis[0]
+        axis.ticker = FixedTicker(ticks=places)
+        axis.major_label_overrides = dict(zip(places, ("star - model", "model", "star"), strict=True))
 
 
 class CorrelationPicture(Picture):
@@ -50,7 +54,10 @@ class CorrelationPicture(Picture):
         self.source = ColumnDataSource({"r": [], "xi": [], "low": [], "high": []})
         self.figure.line("r", "xi", source=self.source, color=BLUE, line_width=1.5)
         self.figure.scatter("r", "xi", source=self.source, color=BLUE, size=7)
-        self.figure.add_layout(Whisker(source=self.source, base="r", lower="low", upper="high", line_color=BLUE))
+        bars = Whisker(source=self.source, base="r", lower="low", upper="high", line_color=BLUE)
+        for head in (bars.upper_head, bars.lower_head):
+            head.line_color = BLUE
+        self.figure.add_layout(bars)
         self.figure.add_layout(Span(location=0.0, dimension="width", line_color=ORANGE, line_dash="dashed"))
 
     def show(self, view: CorrelationView) -> None:
@@ -65,8 +72,9 @@ class RunSession:
     def __init__(self, bench: RunBench, document: Document | None = None) -> None:
         self.bench, self.document, self.state = bench, document, bench.start
         self.title, self.subtitle = f"{bench.folder.resolve().name}: desk of a run", f"{len(bench.ccds)} CCDs"
-        extent = max(1.15 * float(np.abs(bench.centers_mm).max()), 25.0)
-        self.whiskers = WhiskersPicture(extent, _TILE, heights=False)
+        low, high = bench.centers_mm.min(axis=0), bench.centers_mm.max(axis=0)
+        extent, (x, y) = 0.5 * float((high - low).max()) + _CCD, (0.5 * (low + high)).tolist()
+        self.whiskers = WhiskersPicture(extent, 0.02 * extent, heights=False, center_mm=(x, y))
         self.whiskers.background = "ellipticity"
         self.whiskers.figure.on_event(Tap, lambda event: self._tap(event.x, event.y))
         self.stamps, self.xi = StampsPicture(), CorrelationPicture()
