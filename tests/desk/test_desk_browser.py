@@ -18,6 +18,7 @@ if BROWSER is None:
     pytest.skip("the desk in a browser needs Chromium: apt install chromium", allow_module_level=True)
 
 from pachon.desk.bench import Bench  # noqa: E402
+from pachon.desk.run_views import KINDS, RunBench, run_numbers, run_whiskers  # noqa: E402
 from pachon.desk.views import Scene, images_view, numbers, opd_view, spots_view, whiskers_view  # noqa: E402
 
 pytestmark = pytest.mark.long
@@ -181,3 +182,31 @@ def test_an_exported_page_needs_nothing_else(browser, tmp_path):
     assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
     assert problems == []
     page.close()
+
+
+def test_the_desk_of_a_run_draws_its_stars_and_a_clicked_ccd(finished_run, browser):
+    command = [sys.executable, "-m", "pachon", "desk", str(finished_run), "--no-browser", "--port", "5386"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server:
+        assert select.select([server.stdout], [], [], 120.0)[0]
+        url = re.search(r"http\S+", server.stdout.readline())[0]
+        page, problems, hosts = browser.new_page(), [], set()
+        page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
+        page.on("request", lambda request: hosts.add(urlsplit(request.url).hostname))
+        page.goto(url)
+        page.wait_for_function(f"({TEXT})().includes('ellipticity')", timeout=PATIENCE)
+        bench = RunBench(finished_run)
+        for kind in KINDS[::-1]:
+            page.locator("select").first.select_option(kind)
+            table = run_numbers(run_whiskers(bench, replace(bench.start, kind=kind)), len(bench.ccds))
+            wait_for(page, {name: f"{value:.4g}" for name, (value, _) in table.items()})
+        page.locator("select").nth(1).select_option(list(bench.ccds)[-1])
+        page.wait_for_function(
+            "name => Object.values(Bokeh.index).some(v => v.model.title?.text?.startsWith(name))",
+            arg=list(bench.ccds)[-1],
+            timeout=PATIENCE,
+        )
+        page.close()
+        server.send_signal(2)
+        server.communicate(timeout=60)
+    assert problems == []
+    assert hosts - {None} == {"127.0.0.1"}
