@@ -46,6 +46,7 @@ app = typer.Typer(
 _FILES = (
     *("run", "images", "visits", "stack_images", "reproduce", "diagnostics", "measure", "model", "study", "design"),
     *("tolerance", "sweep", "baseline", "camera", "shim", "donuts", "align", "telescope", "files", "config"),
+    *("desk", "warm_up"),
 )
 _GROUPS = [import_module(f".{name}", __package__) for name in _FILES]
 _INTERRUPTED = 130

@@ -10,12 +10,12 @@ from .plain_help import PlainCommand
 PANELS = {
     "Runs and images": "run images visits null-test stack-images reproduce diagnose attribute",
     "Stars and PSF models": "measure model study",
-    "Design analyses": "spots focus zernikes rays fans opd-fans field-curvature lateral-color focal-shift seidel "
+    "Design analyses": "desk spots focus zernikes rays fans opd-fans field-curvature lateral-color focal-shift seidel "
     "spot-matrix illumination throughput strehl target distortion vignetting footprint draw psf ee mtf ghosts opd "
     "design-report",
     "Optimise, tolerance, sweep": "optimize operands sensitivity tolerance sweep baseline check",
     "Camera and alignment": "camera shim donuts align",
-    "Files": "info convert new validate schema config",
+    "Files": "info convert new validate schema config warm-up",
 }
 
 

@@ -55,6 +55,7 @@ PROVISIONAL = frozenset(
         "pachon.models.CornerSensor",
         "pachon.models.GridModes",
         "pachon.models.ParabasalOptics",
+        "pachon.models.OpticsState",
         "pachon.models.corner_focal_plane",
         "pachon.models.corner_sensors",
         "pachon.models.parabasal_optics",

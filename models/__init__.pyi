@@ -46,6 +46,7 @@ from .parameters.changes import apply_changes as apply_changes
 from .parameters.degrees_of_freedom import DegreeOfFreedom as DegreeOfFreedom
 from .parameters.degrees_of_freedom import DegreesOfFreedom as DegreesOfFreedom
 from .parameters.degrees_of_freedom import SurfaceDeformation as SurfaceDeformation
+from .parameters.optics_state import OpticsState as OpticsState
 from .parameters.parameters import Parameter as Parameter
 from .parameters.thermal import thermal as thermal
 from .paraxial import with_floating_pupil as with_floating_pupil

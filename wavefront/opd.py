@@ -94,6 +94,7 @@ def wavefront_opd(
         exists.
     """
     request = Request.of(telescope, field, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
+    focal_plane = request.on(focal_plane).focal_plane
     telescope, threads = request.telescope, request.threads
     if len(request.fields) != 1:
         raise DomainError(f"field of shape {request.fields.shape}: expected two angles")
@@ -173,6 +174,7 @@ def wavefront_opds(
         lands between the CCDs.
     """
     request = Request.of(telescope, fields, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
+    focal_plane = request.on(focal_plane).focal_plane
     x, y, inside = _pupil_points(request.telescope, pupil, grid)
     radius = _sphere_radius(request.telescope, focal_plane, silicon)
     spheres = _spheres(request, radius, focal_plane)

@@ -13,9 +13,11 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments, removed_arguments
 from ..core.errors import ConfigError, DomainError, shown
 from ..core.units import metres, pure_numbers, radians
+from ..models.camera.focal_plane import FocalPlane
 from ..models.design_data import unvignetted, vignetted
 from ..models.telescope import Telescope
 from ..raytrace.aiming import AimedPoints, pupil_coordinates
+from ..raytrace.ideal_lens import require_image
 from ..raytrace.launch import aimed_points
 from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import Projection, Rays, RayStatus, field_direction, straight_bundles
@@ -29,6 +31,9 @@ from .vignetting_factors import made_factors
 RAYS_AT_ONCE = 1 << 19
 #: Radii of the default field points over the radius of the field; for the LSST 0, 0.5, 1, 1.5 and 1.75 degrees.
 _RADII = np.array([0.0, 2.0, 4.0, 6.0, 7.0]) / 7.0
+
+#: Statuses of chief rays that have an image point: apertures do not stop them, nor do gaps between the CCDs.
+_CHIEF = (RayStatus.OK, RayStatus.VIGNETTED, RayStatus.GAP)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +60,8 @@ class Request:
         Vignetting factors of the fields, which change their pupil points, see :class:`~pachon.models.DesignData`.
     stated_weights : ndarray, shape [n_field], optional
         Weights of the fields that the design data state.
+    focal_plane : FocalPlane, optional
+        CCD surfaces on which rays land (:meth:`on`); the nominal detector surface without it.
     """
 
     telescope: Telescope
@@ -67,6 +74,7 @@ class Request:
     primary: float | None = None
     vignetting: np.ndarray | None = None
     stated_weights: np.ndarray | None = None
+    focal_plane: FocalPlane | None = None
 
     def __repr__(self) -> str:
         waves = ", ".join(f"{1e9 * w:.5g}" for w in self.wavelengths[:3]) + ", ..." * (len(self.wavelengths) > 3)
@@ -164,6 +172,37 @@ class Request:
         if sampling is not None or n_pupil is not None:
             changes["pupil"] = pupil_sampling(self.telescope, "gauss" if sampling is None else sampling, n_pupil)
         return replace(self, **changes) if changes else self
+
+    @check_arguments
+    def on(self, focal_plane: FocalPlane | None) -> Request:
+        """Return the request whose rays land on the CCDs.
+
+        Every analysis that lands rays on the detector takes it in place of a telescope. Light that falls between the
+        CCDs is lost; a chief ray there stays on the nominal surface.
+
+        Parameters
+        ----------
+        focal_plane : FocalPlane or None
+            CCD surfaces; None leaves the request as it is.
+
+        Raises
+        ------
+        ConfigError
+            If the request has a focal plane already.
+        DomainError
+            If light is parallel behind the telescope.
+        """
+        if focal_plane is None:
+            return self
+        if self.focal_plane is not None:
+            raise ConfigError("focal_plane: given beside a Request, which has its own", key="focal_plane")
+        require_image(self.telescope, "a focal plane")
+        return replace(self, focal_plane=focal_plane)
+
+    def require_nominal_detector(self, purpose: str) -> None:
+        """Refuse a focal plane for a purpose that knows the nominal detector surface only."""
+        if self.focal_plane is not None:
+            raise ConfigError(f"focal_plane: expected none for {purpose}, on the nominal detector", key="focal_plane")
 
     def at_fields(self, fields: np.ndarray | slice) -> Request:
         """Return the request for a part of its fields, or for other field angles [rad], without vignetting factors."""
@@ -281,7 +320,7 @@ class Request:
             chief = self.entrance_points_of(self.telescope, wavelength, np.zeros((1, 2))).reshape(1, 2)
             through = np.concatenate([entrance, chief])
             rays = straight_bundles(self.telescope, self.directions, wavelength, through)
-        end = trace(self.telescope, rays, threads=self.threads)
+        end = trace(self.telescope, rays, focal_plane=self.focal_plane, threads=self.threads)
         n, detector = len(self.fields), self.telescope.surfaces[-1]
         position = detector.to_local(end.position).reshape(n, -1, 3)
         direction = detector.along(end.direction).reshape(n, -1, 3)
@@ -291,7 +330,7 @@ class Request:
             direction=direction[:, :-1],
             path=path[:, :-1],
             status=status[:, :-1],
-            chief_position=np.where(status[:, -1:] <= RayStatus.VIGNETTED, position[:, -1], np.nan),
+            chief_position=np.where(np.isin(status[:, -1:], _CHIEF), position[:, -1], np.nan),
             chief_direction=direction[:, -1],
             chief_path=path[:, -1],
             index=float(refractive_indices(self.telescope, wavelength)[-2]),

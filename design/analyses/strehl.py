@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.plotting import BLUE
 from ...core.threads import one_blas_thread
+from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ...raytrace.rays import Projection
 from ...wavefront.pupil_sampling import PupilSampling, SamplingName
@@ -102,6 +103,7 @@ def strehl(
     from_psf: bool = True,
     sampling: SamplingName | PupilSampling | None = None,
     n_pupil: int | None = None,
+    focal_plane: FocalPlane | None = None,
     projection: Projection | None = None,
     threads: int | None = None,
 ) -> StrehlRatios:
@@ -113,6 +115,8 @@ def strehl(
         As in :meth:`pachon.Request.of`; the points of the pupil are those of the wavefronts.
     from_psf : bool
         Make diffraction images too (:func:`pachon.fft_psf`).
+    focal_plane : FocalPlane, optional
+        CCD surfaces, as in :meth:`pachon.Request.on`; the nominal detector surface without it.
 
     Raises
     ------
@@ -121,7 +125,7 @@ def strehl(
     """
     request = Request.of(
         telescope, fields, wavelengths, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
-    )
+    ).on(focal_plane)
     telescope, threads, projection = request.telescope, request.threads, request.projection
     shape = (len(request.fields), len(request.wavelengths))
     rms, ratio, peak = (np.full(shape, np.nan) for _ in range(3))
@@ -132,6 +136,7 @@ def strehl(
             rms[i, w], ratio[i, w] = _rms_and_strehl(opd[i], lit, request, wavelength)
         if from_psf:
             star = Request.of(telescope, request.fields, wavelength, projection=projection, threads=threads)
+            star = star.on(request.focal_plane)
             peak[:, w] = fft_psf(star, pixels=64).strehl
     return StrehlRatios(request, rms, ratio, peak)
 

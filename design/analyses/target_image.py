@@ -199,6 +199,7 @@ def target_image(
         projection=projection,
         threads=threads,
     )
+    request.require_nominal_detector("images of targets")
     telescope = request.telescope
     principal = principal_rays_of(request)
     require_focus(telescope, principal.mean_f_number, principal.mean_plate_scale)

@@ -20,6 +20,7 @@ from ...core.errors import DomainError
 from ...core.memory import require_bytes
 from ...core.threads import one_blas_thread
 from ...core.units import field_label, length, require_count, require_within
+from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling, SamplingName, pupil_sampling
 from ...wavefront.request import Request, relative_weights
@@ -67,6 +68,7 @@ def fft_psf(
     pixels: int = _PIXELS,
     n_pupil: int | None = None,
     reference: SpotReference = "centroid",
+    focal_plane: FocalPlane | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> DiffractionPsf:
@@ -86,6 +88,8 @@ def fft_psf(
         side of the image.
     reference : {"centroid", "chief"}
         Middle of the images: the centroid of the rays, or the chief ray of the middle wavelength.
+    focal_plane : FocalPlane, optional
+        CCD surfaces, as in :meth:`pachon.Request.on`; the nominal detector surface without it.
     progress : callable, optional
         Called with the number of pairs of field and wavelength done since the last call.
 
@@ -96,7 +100,7 @@ def fft_psf(
     DomainError
         If a number is out of range, no light passes, or the lattice is too coarse for the spots or the image.
     """
-    request = Request.of(telescope, fields, wavelengths, threads=threads)
+    request = Request.of(telescope, fields, wavelengths, threads=threads).on(focal_plane)
     telescope = request.telescope
     plan = _Plan(request, pixel, pixels, reference)
     side, unit = plan.pixel * plan.pixels, "urad" if telescope.design_data.afocal else "um"
@@ -146,9 +150,9 @@ def huygens_psf(
 ) -> DiffractionPsf:
     """Make diffraction images by summing the plane wave of every ray at every pixel.
 
-    Parameters and errors are those of :func:`fft_psf`, but for `sampling` and `n_pupil`, which are those of
-    :meth:`pachon.Request.of`: by default a square lattice, 160 across. Gauss quadrature needs far fewer points where
-    nothing is vignetted.
+    Parameters and errors are those of :func:`fft_psf`, but for `focal_plane`, which a request holds, and for
+    `sampling` and `n_pupil`, which are those of :meth:`pachon.Request.of`: by default a square lattice, 160 across.
+    Gauss quadrature needs far fewer points where nothing is vignetted.
     """
     request = Request.of(
         telescope,

@@ -14,6 +14,7 @@ from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import ConfigError, DomainError, shown
 from ...core.plotting import BLUE, ORANGE, RED, figure_at, styled
 from ...core.units import arcseconds, metres, pure_numbers, require_count
+from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
 from ..drawing import FEW, field_colors, finish_axes, second_scale
@@ -116,6 +117,7 @@ def encircled_energy(
     radii: ArrayLike | None = None,
     reference: SpotReference | None = None,
     n_pupil: int | None = None,
+    focal_plane: FocalPlane | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> EncircledEnergy:
@@ -139,6 +141,8 @@ def encircled_energy(
     n_pupil : int, optional
         Number of pupil points, as in :func:`pachon.fft_psf` ("diffraction") or in :meth:`pachon.Request.of`
         ("geometric").
+    focal_plane : FocalPlane, optional
+        CCD surfaces, as in :meth:`pachon.Request.on`; the nominal detector surface without it.
     progress : callable, optional
         Called with the number of pairs of field and wavelength done since the last call ("diffraction").
 
@@ -164,6 +168,7 @@ def encircled_energy(
             "kind": kind,
             "reference": reference,
             "n_pupil": n_pupil,
+            "focal_plane": focal_plane,
         }
         for name, value in sources.items():
             if value is not None:
@@ -174,7 +179,7 @@ def encircled_energy(
         return _of_images(telescope, circle_radii)
     kind = "diffraction" if kind is None else kind
     reference = "centroid" if reference is None else reference
-    request = Request.of(telescope, fields, wavelengths, threads=threads)
+    request = Request.of(telescope, fields, wavelengths, threads=threads).on(focal_plane)
     if kind == "geometric":
         return _of_spots(spots(request, sampling="spiral", n_pupil=n_pupil, reference=reference), circle_radii)
     images = fft_psf(request, pixels=_PIXELS, n_pupil=n_pupil, reference=reference, progress=progress)

@@ -272,6 +272,7 @@ def _wavefronts(request: Request) -> tuple[np.ndarray, np.ndarray]:
         request.fields,
         w,
         request.pupil.points,
+        focal_plane=request.focal_plane,
         vignetting=request.vignetting,
         projection=request.projection,
         threads=request.threads,

@@ -188,7 +188,8 @@ def principal_rays_of(request: Request) -> PrincipalRays:
     """Return chief and marginal rays for the field points of a request at its middle wavelength."""
     telescope, wavelength = request.telescope, request.middle
     pupil = pupil_sampling(telescope, "gauss", _RINGS)
-    request = replace(request, wavelengths=np.array([wavelength]), weights=np.ones(1), pupil=pupil)
+    # Heights of CCDs change none of it: all is on the nominal detector.
+    request = replace(request, wavelengths=np.array([wavelength]), weights=np.ones(1), pupil=pupil, focal_plane=None)
     n, slopes, axes = len(request.fields), request.slopes, tangential_axes(request)
     steps = JACOBIAN_STEP * np.concatenate([np.zeros((n, 1, 2)), axes, -axes], axis=1)
     # Per field: the direction of the chief ray and four beside it; each through centre, near zone and rim of the pupil.

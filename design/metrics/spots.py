@@ -12,6 +12,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import BLUE, RED, styled
 from ...core.units import arcseconds
+from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ...raytrace.rays import Projection
 from ...wavefront.pupil_sampling import PupilSampling, SamplingName
@@ -189,6 +190,7 @@ def spots(
     sampling: SamplingName | PupilSampling | None = None,
     n_pupil: int | None = None,
     reference: SpotReference = "centroid",
+    focal_plane: FocalPlane | None = None,
     projection: Projection | None = None,
     threads: int | None = None,
 ) -> SpotDiagram:
@@ -200,11 +202,13 @@ def spots(
         As in :meth:`pachon.Request.of`.
     reference : {"centroid", "chief"}
         Origin of the displacements: the centroid, or the chief ray of the middle wavelength.
+    focal_plane : FocalPlane, optional
+        CCD surfaces, as in :meth:`pachon.Request.on`; the nominal detector surface without it.
 
     Raises
     ------
     ConfigError
-        If the reference is unknown.
+        If the reference is unknown, or a focal plane is given beside a request that has one.
     """
     request = Request.of(
         telescope,
@@ -216,7 +220,7 @@ def spots(
         projection=projection,
         threads=threads,
     )
-    return spot_diagram(request, reference)
+    return spot_diagram(request.on(focal_plane), reference)
 
 
 def spot_diagram(request: Request, reference: SpotReference = "centroid") -> SpotDiagram:

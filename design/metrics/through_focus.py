@@ -18,6 +18,7 @@ from ...core.errors import DomainError, shown
 from ...core.plotting import figure_at, styled
 from ...core.threads import one_blas_thread
 from ...core.units import field_label, metres
+from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import require_image
 from ...raytrace.rays import Projection
@@ -125,6 +126,7 @@ def through_focus(
     wavelength_weights: ArrayLike | None = None,
     sampling: SamplingName | PupilSampling | None = None,
     n_pupil: int | None = None,
+    focal_plane: FocalPlane | None = None,
     projection: Projection | None = None,
     threads: int | None = None,
 ) -> ThroughFocus:
@@ -137,6 +139,8 @@ def through_focus(
     defocus : array_like or Quantity, shape [n_height], optional
         Heights above the nominal detector [m], ascending; by default about the common best focus, to where the spots
         are about three times as large.
+    focal_plane : FocalPlane, optional
+        CCD surfaces, as in :meth:`pachon.Request.on`; the nominal detector surface without it.
 
     Raises
     ------
@@ -152,7 +156,7 @@ def through_focus(
         n_pupil=n_pupil,
         projection=projection,
         threads=threads,
-    )
+    ).on(focal_plane)
     require_image(request.telescope, "a focus")
     bundles = [request.bundles(float(w)) for w in request.wavelengths]
     square = _mean_squares(request, bundles)

@@ -59,6 +59,7 @@ class Beams:
             for name, value in stated.items():
                 if value is not None:
                     raise ConfigError(f"{name} = {shown(value)}: given beside a Request, which has its own", key=name)
+            telescope.require_nominal_detector("merit functions")
             request = telescope
         else:
             count = _RINGS if n_pupil is None and sampling == "gauss" else n_pupil

@@ -49,6 +49,12 @@ class CcdSurfaces:
         polynomial[:, 0] = heights
         return cls(half_sizes, polynomial, np.zeros((len(half_sizes), 2, 4)))
 
+    def scaled(self, factor: float) -> CcdSurfaces:
+        """Return the surfaces with all heights multiplied by a factor."""
+        grid = None if self.grid is None else factor * self.grid
+        zernikes = None if self.zernikes is None else self.zernikes.scaled(factor)
+        return CcdSurfaces(self.half_sizes, factor * self.polynomial, self.waves * [factor, 1, 1, 1], grid, zernikes)
+
     def height(self, ccd: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
         """Return heights [m] at local positions [m] on CCDs of given index, all of one shape (n,)."""
         c = self.polynomial[ccd]

@@ -7,7 +7,7 @@ detector. Camera teams often use the opposite sign: change it before a table or 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,16 @@ from ...core.units import metres, plane_points, radians, require_count
 from .camera import Camera
 from .cameras import load_camera
 from .ccd_surfaces import CcdSurfaces
-from .height_budget import BudgetName, HeightBudget, chosen_terms, draw_heights, load_budget
+from .height_budget import (
+    BUDGET_KEYS,
+    TERMS,
+    BudgetName,
+    HeightBudget,
+    chosen_terms,
+    draw_heights,
+    load_budget,
+    term_heights,
+)
 from .height_fit import fit_heights, table_column
 from .height_map import HeightMap
 
@@ -224,6 +233,46 @@ class FocalPlane(HeightMap):
         if self.budget is None or self.seed is None:
             raise DomainError(f"terms = {terms!r}: expected a focal plane drawn from a height budget")
         return FocalPlane.from_budget(self.camera, seed=self.seed, terms=terms, budget=self.budget)
+
+    @check_arguments
+    def scaled(self, factors: float | Mapping[str, float]) -> FocalPlane:
+        """Return the focal plane with scaled heights, without drawing them again.
+
+        Parameters
+        ----------
+        factors : float or mapping of str to float
+            Factor of all heights; or factors, not negative, by which terms of the budget are larger than now, 1 for
+            terms that are left out. The result is that of :meth:`from_budget` with the larger budget.
+
+        Raises
+        ------
+        UnknownNameError
+            If a term does not exist.
+        DomainError
+            If a factor is not finite, that of a term is negative, or the heights were not drawn from a budget.
+        """
+        by_term = factors if isinstance(factors, Mapping) else {}
+        for name, value in (by_term or {"factors": factors}).items():
+            if not np.isfinite(value) or (by_term and value < 0):
+                raise DomainError(f"{name} = {value!r}: expected a finite factor{', not negative' if by_term else ''}")
+        if not isinstance(factors, Mapping):
+            residual = None if self.residual is None else abs(factors) * self.residual
+            surfaces = self.surfaces.scaled(factors)
+            return replace(self, surfaces=surfaces, residual=residual, terms=(), budget=None, seed=None)
+        chosen_terms(by_term)
+        if self.budget is None or self.seed is None:
+            raise DomainError("factors of terms: expected a focal plane drawn from a height budget")
+        parts = [
+            term_heights(self.camera, self.budget, self.seed, term).scaled(by_term.get(term, 1.0))
+            for term in self.terms
+        ]
+        nothing = CcdSurfaces.level(self.camera.half_sizes)
+        polynomial = sum((part.polynomial for part in parts), nothing.polynomial)
+        # One term at most has waves.
+        waves = sum((part.waves for part in parts), nothing.waves)
+        sizes = {BUDGET_KEYS[term]: by_term.get(term, 1.0) * getattr(self.budget, BUDGET_KEYS[term]) for term in TERMS}
+        surfaces = CcdSurfaces(self.camera.half_sizes, polynomial, waves)
+        return replace(self, surfaces=surfaces, budget=replace(self.budget, **sizes))._placed()
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -93,6 +93,12 @@ def chosen_terms(terms: str | Iterable[str] | None) -> tuple[str, ...]:
     return tuple(term for term in TERMS if term in names)
 
 
+@lru_cache(maxsize=16)
+def term_heights(camera: Camera, budget: HeightBudget, seed: int, term: str) -> CcdSurfaces:
+    """Return the heights of one term, drawn once for sums that scale the terms."""
+    return draw_heights(camera, budget, seed, (term,))
+
+
 def draw_heights(camera: Camera, budget: HeightBudget, seed: int, terms: tuple[str, ...]) -> CcdSurfaces:
     """Draw the heights of every CCD: the sum of the given terms, of `TERMS`."""
     polynomial = np.zeros((len(camera), 10))
@@ -197,3 +203,11 @@ def _potato_chip(camera: Camera, budget: HeightBudget, seed: int) -> tuple[np.nd
 
 _DRAWS = {"global": _global, "raft": _raft, "ccd": _ccd, "tilt": _tilt}
 TERMS = (*_DRAWS, "potato_chip")
+#: Size of each term among the fields of the budget.
+BUDGET_KEYS = {
+    "global": "global_height",
+    "raft": "raft_height",
+    "ccd": "ccd_height",
+    "tilt": "ccd_tilt",
+    "potato_chip": "potato_chip",
+}

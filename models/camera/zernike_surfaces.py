@@ -47,6 +47,10 @@ class ZernikeSurfaces:
         """Return the surfaces of some sensors."""
         return ZernikeSurfaces(self.radius[index], self.origin[index], self.coefficients[index], self.limits[index])
 
+    def scaled(self, factor: float) -> ZernikeSurfaces:
+        """Return the surfaces with all heights multiplied by a factor."""
+        return ZernikeSurfaces(self.radius, self.origin, factor * self.coefficients, self.limits)
+
     def turned(self, quarters: np.ndarray) -> ZernikeSurfaces:
         """Return the surfaces in axes turned by quarters from +x towards +y, one number each sensor, shape [n]."""
         origin, coefficients, limits = self.origin.copy(), self.coefficients.copy(), self.limits.copy()

@@ -23,6 +23,7 @@ LAYERS = [
     "pipeline",
     "imaging",
     "studies",
+    "desk",
     "commands",
 ]
 FILES = [path for layer in LAYERS for path in sorted((ROOT / layer).rglob("*.py"))]

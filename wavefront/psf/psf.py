@@ -173,6 +173,7 @@ def psf_inputs(
     if isinstance(telescope, Request):
         lengths = wavelengths.wavelengths if isinstance(wavelengths, Light) else wavelengths
         request = Request.of(telescope, fields, lengths, threads=threads)
+        focal_plane = request.on(focal_plane).focal_plane
         telescope, fields, projection, threads = request.telescope, request.fields, request.projection, request.threads
         wavelengths = Light(request.wavelengths, request.weights if np.ptp(request.weights) else None)
     if fields is None or wavelengths is None:

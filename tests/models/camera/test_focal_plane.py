@@ -372,3 +372,38 @@ def test_moves_of_unknown_rafts_and_by_no_number_are_refused():
         plane.with_moved("R00", dz=1e-6)
     with pytest.raises(DomainError, match=r"R22 dz = nan: expected one finite number"):
         plane.with_moved("R22", dz=np.nan)
+
+
+def test_scaled_terms_are_the_draw_of_a_scaled_budget():
+    plane, factors = FocalPlane.from_budget(seed=3), {"raft": 2.0, "potato_chip": 0.0, "global": 0.5}
+    budget = HeightBudget(5e-6, 13e-6, 10e-6, 2.5e-4, 0.0)
+    drawn, scaled = FocalPlane.from_budget(seed=3, budget=budget), plane.scaled(factors)
+    # Other orders of sums: rounding of some 10 um.
+    np.testing.assert_allclose(scaled.polynomial, drawn.polynomial, rtol=0, atol=1e-19)
+    np.testing.assert_allclose(scaled.waves, drawn.waves, rtol=0, atol=1e-12)
+    assert scaled.budget == drawn.budget
+    # Heights are linear in the factors, and a factor is of the heights as they are now.
+    np.testing.assert_allclose(
+        scaled.scaled({"raft": 0.5}).polynomial, plane.scaled(factors | {"raft": 1.0}).polynomial
+    )
+    assert plane.with_terms("raft").scaled({"ccd": 3.0}).terms == ("raft",)
+
+
+@pytest.mark.parametrize("plane", [FocalPlane.from_budget(seed=3), FocalPlane.as_measured()])
+def test_scaled_heights_are_the_heights_times_a_factor(plane):
+    x, y = 0.9e-2 * np.array([[-20.0, 3.0, 14.0], [5.0, -2.0, 11.0]])
+    scaled = plane.scaled(-2.0)
+    np.testing.assert_allclose(scaled.height(x, y), -2.0 * plane.height(x, y), rtol=1e-12)
+    np.testing.assert_allclose(scaled.gradient(x, y), -2.0 * plane.gradient(x, y), rtol=1e-12)
+
+
+def test_factors_that_mean_nothing_are_refused():
+    plane = FocalPlane.flat()
+    with pytest.raises(DomainError, match=r"^factors of terms: expected a focal plane drawn from a height budget$"):
+        plane.scaled({"raft": 2.0})
+    with pytest.raises(DomainError, match=r"^raft = -1.0: expected a finite factor, not negative$"):
+        FocalPlane.from_budget(seed=1).scaled({"raft": -1.0})
+    with pytest.raises(UnknownNameError, match="wobble"):
+        FocalPlane.from_budget(seed=1).scaled({"wobble": 1.0})
+    with pytest.raises(DomainError, match=r"^factors = nan"):
+        plane.scaled(float("nan"))

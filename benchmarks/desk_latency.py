@@ -1,0 +1,53 @@
+"""Time from a move of a slider to the redrawn pictures of the desk, for the LSST.
+
+Run: python benchmarks/desk_latency.py [moves]
+
+Moves of M2 along the axis on one page: spots of 21 fields, the OPD map and Zernikes at the star, and whiskers on the
+189 CCDs are drawn at once; then the images of the star and the layout; 10 whiskers a CCD last, where they are wanted.
+Sources of Bokeh are updated as they are for a browser, whose own time (some 50 ms a picture's worth of data) is not in
+it. The growth of the resident memory over the moves is printed too.
+"""
+
+import resource
+import sys
+import time
+
+import numpy as np
+
+from pachon.desk.bench import Bench
+from pachon.desk.session import Session
+from pachon.desk.views import Scene, whiskers_view
+
+MOVES = int(sys.argv[1]) if len(sys.argv) > 1 else 40
+
+
+def timed(function) -> float:
+    """Return the time of a call [ms]."""
+    start = time.perf_counter()
+    function()
+    return 1e3 * (time.perf_counter() - start)
+
+
+def show(name: str, times: list[float]) -> None:
+    """Print the median and the 95th percentile."""
+    print(f"{name:40s} median {np.median(times):6.0f} ms, 95 % {np.quantile(times, 0.95):6.0f} ms")
+
+
+bench = Bench("lsst_v3.3_r")
+session = Session(bench)
+session.schedule = lambda: None
+fast, slow, many = [], [], []
+memory = 0
+for move in range(MOVES):
+    session.set_value("optics.M2_dz", 0.5 * ((move % 40) - 20))
+    fast.append(timed(session.redraw_fast))
+    slow.append(timed(session.redraw_slow))
+    if move % 10 == 0:
+        scene = Scene.of(bench, session.history.state)
+        many.append(timed(lambda: whiskers_view(scene, 10)))  # noqa: B023 - called at once
+    if move == min(20, MOVES - 1):
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+show("spots, OPD, Zernikes, 189 whiskers", fast)
+show("images, encircled energy, layout", slow)
+show("189 x 10 whiskers", many)
+print(f"growth of the peak memory: {(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory) / 1024:.0f} MiB")

@@ -1,0 +1,423 @@
+"""A session of a desk: one history of states, its widgets, and the pictures that follow them."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from collections.abc import Callable
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from bokeh.document import Document
+from bokeh.events import DocumentReady
+from bokeh.layouts import column, row
+from bokeh.models import (
+    Button,
+    CustomJS,
+    FileInput,
+    Select,
+    Slider,
+    Spinner,
+    TextAreaInput,
+)
+
+from ..core.errors import PachonError
+from .bench import Bench, Control
+from .pictures import (
+    BACKGROUNDS,
+    EnergyPicture,
+    ImagePicture,
+    OpdPicture,
+    SectionPicture,
+    SpotsPicture,
+    WhiskersPicture,
+    ZernikePicture,
+)
+from .python_text import python_text
+from .state import DeskState, History
+from .views import (
+    HeightsView,
+    ImagesView,
+    OpdView,
+    Scene,
+    SpotsView,
+    WhiskersView,
+    heights_view,
+    images_view,
+    numbers,
+    opd_view,
+    section_view,
+    spots_view,
+    whiskers_view,
+)
+from .widgets import FIRST_THEME, colour, number_boxes, status_line, status_text, theme_toggle
+
+#: Range of the lift of one CCD or raft [um].
+_LIFT = 50.0
+#: Time for further changes to arrive before all are drawn at once [ms].
+_PAUSE = 15
+#: Longest time between two changes of one drag [s].
+_DRAG = 2.0
+#: Largest file of a state that is read [bytes].
+_MOST_BYTES = 10**6
+_LIFTS = "Heights of CCDs"
+#: Downloads the text of a hidden field under a name.
+_DOWNLOAD = """
+const link = document.createElement('a');
+link.href = URL.createObjectURL(new Blob([text.value], {type: 'text/plain'}));
+link.download = name;
+link.click();
+URL.revokeObjectURL(link.href);
+"""
+
+
+class Session:
+    """The desk of one page in a browser; two pages share nothing but the bench."""
+
+    def __init__(self, bench: Bench, state: DeskState | None = None, document: Document | None = None) -> None:
+        self.bench, self.document = bench, document
+        self.title, self.subtitle = f"{bench.nominal.name}: desk", bench.nominal.description
+        self.history = History(bench.check(state or bench.start))
+        self.views: dict[type, Any] = {}
+        self.compared: dict[type, Any] = {}
+        self.redraws = 0
+        self._waiting = self._syncing = False
+        self._changed = 0.0
+        self._changed_geometry = self._changed_heights = True
+        self._sliders: dict[str, tuple[Slider, Spinner]] = {}
+        self._groups: dict[str, Any] = {}
+        self._lifted = next(iter(self.bench.lifted_names), "")
+        self._make_pictures()
+        self._make_widgets()
+        self.paint("light")
+        self.redraw_fast()
+        self.redraw_slow()
+
+    # Pictures
+
+    def _make_pictures(self) -> None:
+        places, _ = self.bench.stars()
+        extent = 1e3 * float(np.abs(places).max())
+        camera = self.bench.camera
+        tile = 2e3 * float(camera.half_sizes.min()) if camera is not None else 0.2 * extent
+        if camera is not None and len(places) > len(camera):
+            tile /= np.sqrt(len(places) / len(camera))
+        self.spots = SpotsPicture(np.rad2deg(self.bench.spot_fields), self._choose_field)
+        self.opd, self.zernikes, self.energy = OpdPicture(), ZernikePicture(), EnergyPicture()
+        self.optics = ImagePicture("optics", "Rays of the star, optics alone")
+        self.seen = ImagePicture("seen", "Image of the star, with the atmosphere")
+        self.whiskers = WhiskersPicture(extent, tile, heights=camera is not None)
+        self.section = SectionPicture()
+        self.pictures = (self.spots, self.whiskers, self.opd, self.zernikes, self.optics, self.seen, self.energy)
+        self.pictures = (*self.pictures, self.section)
+
+    def paint(self, theme: str) -> None:
+        """Colour the pictures by a theme."""
+        self.theme = theme
+        for picture in self.pictures:
+            picture.paint(theme)
+
+    def _choose_field(self, index: int) -> None:
+        x, y = np.rad2deg(self.bench.spot_fields[index])
+        state = self.history.state.with_value("field_deg.x", round(float(x), 6))
+        self.change(state.with_value("field_deg.y", round(float(y), 6)))
+
+    # Widgets
+
+    def _make_widgets(self) -> None:
+        self.status, self.table = status_line()
+        groups = list(dict.fromkeys(control.group for control in self.bench.controls))
+        self.group = Select(title="Controls", value=groups[0], options=groups, sizing_mode="stretch_width")
+        self.group.on_change("value", lambda attribute, old, new: self._show_group(new))
+        self.sliders = column(sizing_mode="stretch_width")
+        self._show_group(groups[0])
+        backgrounds = list(BACKGROUNDS if self.bench.camera is not None else BACKGROUNDS[1:])
+        self.background = Select(title="Behind the whiskers", value=backgrounds[0], options=backgrounds)
+        self.background.sizing_mode = "stretch_width"
+        self.background.on_change("value", lambda attribute, old, new: self._set_background(new))
+        stars = "CCD" if self.bench.camera is not None else "place"
+        self.density = Select(
+            title="Whiskers", value="1", options=[("1", f"1 a {stars}"), ("10", f"10 a {stars}, after a moment")]
+        )
+        self.density.sizing_mode = "stretch_width"
+        self.density.on_change("value", lambda attribute, old, new: self.schedule())
+        self.state_text = TextAreaInput(value="", visible=False)
+        self.python = TextAreaInput(value="", visible=False)
+        load = FileInput(accept=".yaml,.yml", title="Load a state (.yaml)", sizing_mode="stretch_width")
+        load.on_change("value", lambda attribute, old, new: self._load(new))
+        self.theme_toggle = theme_toggle(self.paint)
+        buttons = [
+            row(_button("Undo", self.undo), _button("Redo", self.redo), _button("Reset", self.reset)),
+            row(_button("Pin as A", self.pin), _button("Back to A", self.back_to_pinned), self.theme_toggle),
+        ]
+        if self.bench.is_lsst:
+            hide = _button("Misalign M2, hidden", self.misalign, 150)
+            buttons.append(row(hide, _button("Reveal", self.reveal)))
+        saved = _download("Save state", self.state_text, "desk.yaml")
+        save = row(saved, _download("As Python", self.python, "desk.py"))
+        parts = [self.group, self.sliders, *buttons, self.background, self.density, save, load]
+        self.sidebar = column(*parts, self.state_text, self.python, name="sidebar", sizing_mode="stretch_width")
+
+    def _show_group(self, group: str) -> None:
+        if group not in self._groups:
+            rows = [self._row(control) for control in self.bench.controls if control.group == group]
+            if group == _LIFTS:
+                rows += self._lift_rows()
+            for part in rows:
+                colour(part)
+            self._groups[group] = rows
+        self._sync()
+        self.sliders.children = self._groups[group]
+
+    def _row(self, control: Control) -> Any:
+        low, high = control.low, control.high
+        label = f"{control.label} [{control.unit}]"
+        format_text = "0[.]0000" if control.step < 0.01 else "0[.]00"
+        value = self.history.state.value(self._key(control.key))
+        shown = {"sizing_mode": "stretch_width", "min_width": 120, "format": format_text, "margin": (2, 5, 0, 5)}
+        slider = Slider(title=label, start=low, end=high, step=control.step, value=value, **shown)
+        number = Spinner(title="", value=value, step=control.step, width=88, margin=(14, 5, 0, 5), name=control.key)
+        self._sliders[control.key] = slider, number
+        slider.on_change("value", lambda attribute, old, new: self.set_value(control.key, new))
+        number.on_change("value", lambda attribute, old, new: self.set_value(control.key, new, drag=False))
+        return row(slider, number, sizing_mode="stretch_width")
+
+    def _lift_rows(self) -> list[Any]:
+        names = list(self.bench.lifted_names)
+        select = Select(title="Raft or CCD to lift", value=self._lifted, options=names, sizing_mode="stretch_width")
+        lift = self._row(Control("lifts", "Its lift", "um", _LIFTS, -_LIFT, _LIFT, 0.5))
+
+        def choose(attribute: str, old: str, new: str) -> None:
+            self._lifted = new
+            self._sync()
+
+        select.on_change("value", choose)
+        return [select, lift]
+
+    def _key(self, key: str) -> str:
+        return f"lifts.{self._lifted}" if key == "lifts" else key
+
+    def _sync(self) -> None:
+        """Set all widgets to the numbers of the state."""
+        self._syncing = True
+        try:
+            for key, (slider, number) in self._sliders.items():
+                value = self.history.state.value(self._key(key))
+                slider.update(start=min(slider.start, value), end=max(slider.end, value))
+                for widget in (slider, number):
+                    if widget.value != value:
+                        widget.value = value
+        finally:
+            self._syncing = False
+
+    # Changes
+
+    def set_value(self, key: str, value: float | None, *, drag: bool = True) -> None:
+        """Set the number of a control; all of a drag are one step to undo."""
+        if self._syncing or value is None:
+            return
+        if not drag or monotonic() - self._changed > _DRAG:
+            self.history.settle()
+        self._changed = monotonic()
+        key = self._key(key)
+        try:
+            state = self.history.state.with_value(key, value)
+        except PachonError as error:
+            self._say(error)
+            self._sync()
+            return
+        self.change(state, key)
+
+    def change(self, state: DeskState, control: str = "") -> None:
+        """Go to a state and draw it; one that is impossible is one line, and the last good one stays."""
+        try:
+            Scene.of(self.bench, state)
+        except PachonError as error:
+            self._say(error)
+        else:
+            self._say("")
+            before = self.history.state
+            self.history.push(state, control)
+            self._follow(before)
+        self._sync()
+
+    def _follow(self, before: DeskState) -> None:
+        state = self.history.state
+        self._changed_geometry |= before.total_optics != state.total_optics
+        heights = (before.heights, before.lifts, before.seed) != (state.heights, state.lifts, state.seed)
+        self._changed_heights |= heights
+        self.schedule()
+
+    def undo(self) -> None:
+        """Undo the last change."""
+        self._jump(self.history.undo)
+
+    def redo(self) -> None:
+        """Redo what was undone."""
+        self._jump(self.history.redo)
+
+    def reset(self) -> None:
+        """Go to the state at the beginning."""
+        self.change(self.history.start)
+
+    def pin(self) -> None:
+        """Keep the state as A, that others are compared to."""
+        self.history.reference = self.history.state
+        self.compared = dict(self.views)
+        self.schedule()
+
+    def back_to_pinned(self) -> None:
+        """Go to the state that was kept as A."""
+        self.change(self.history.reference)
+
+    def misalign(self) -> None:
+        """Add a misalignment of M2 that the sliders do not show."""
+        self.change(self.history.state.misaligned(int(np.random.default_rng().integers(2**31))))
+
+    def reveal(self) -> None:
+        """Say what is hidden, and what the sliders leave of it."""
+        hidden, total = self.history.state.hidden, self.history.state.total_optics
+        units = dict(zip(self.bench.freedoms.names, self.bench.freedoms.units, strict=True))
+        rows = [f"{name}: {value:+.4g} {units[name]}, now {total[name]:+.4g}" for name, value in hidden.items()]
+        self._say("; ".join(rows) or "nothing is hidden", error=False)
+
+    def _jump(self, go: Callable[[], DeskState]) -> None:
+        before = self.history.state
+        go()
+        self._follow(before)
+        self._say("")
+        self._sync()
+
+    def _load(self, content: str) -> None:
+        try:
+            text = base64.b64decode(content, validate=True)[: _MOST_BYTES + 1].decode("utf-8")
+            state = DeskState.from_yaml(text[:_MOST_BYTES], "the file")
+        except (binascii.Error, UnicodeDecodeError):
+            self._say("the file: expected text in UTF-8, as the desk saves it")
+        except PachonError as error:
+            self._say(error)
+        else:
+            self.change(state)
+
+    def _set_background(self, name: str) -> None:
+        self.whiskers.background = name
+        self.whiskers.paint(self.theme)
+        self._show_whiskers()
+
+    @property
+    def state_words(self) -> str:
+        """The state as a file of it has it."""
+        return self.history.state.to_yaml()
+
+    # Drawing
+
+    def schedule(self) -> None:
+        """Draw once, soon, however many changes come before; at once where there is no document."""
+        if self.document is None or self.document.session_context is None:
+            self.redraw_fast()
+            self.redraw_slow()
+        elif not self._waiting:
+            self._waiting = True
+            self.document.add_timeout_callback(self._draw_scheduled, _PAUSE)
+
+    def _draw_scheduled(self) -> None:
+        self._waiting = False
+        self.redraw_fast()
+        if self.document is not None:
+            self.document.add_timeout_callback(self._draw_rest, _PAUSE)
+
+    def _draw_rest(self) -> None:
+        # A change that has come in between is drawn first.
+        if not self._waiting:
+            self.redraw_slow()
+
+    def redraw_fast(self) -> None:
+        """Draw spots, wavefront and coarse whiskers, which follow a slider."""
+        scene = Scene.of(self.bench, self.history.state)
+        try:
+            self.views[SpotsView] = spots_view(scene)
+        except PachonError as error:
+            # The last good state comes back.
+            self.history.undo()
+            self._say(error)
+            self._sync()
+            return
+        self._update(OpdView, lambda: opd_view(scene))
+        if self._changed_heights and self.bench.camera is not None:
+            self._update(HeightsView, lambda: heights_view(scene.focal_plane or self.bench.flat))
+            self._changed_heights = False
+        self._update(WhiskersView, lambda: whiskers_view(scene))
+        if SpotsView in self.views:
+            self.spots.show(self.views[SpotsView], scene.state.field_deg)
+        if OpdView in self.views:
+            self.opd.show(self.views[OpdView])
+            self.zernikes.show(self.views[OpdView], self.compared.get(OpdView))
+        self._show_whiskers()
+        self._show_numbers()
+        self.redraws += 1
+
+    def redraw_slow(self) -> None:
+        """Draw images, encircled energy, the section and fine whiskers."""
+        scene = Scene.of(self.bench, self.history.state)
+        self._update(ImagesView, lambda: images_view(scene))
+        if ImagesView in self.views:
+            view = self.views[ImagesView]
+            self.optics.show(view.optics, view.optics_arcsec)
+            if view.seen is not None:
+                self.seen.show(view.seen, view.seen_arcsec)
+            self.seen.figure.visible = view.seen is not None
+            self.energy.show(view, self.compared.get(ImagesView))
+        if self._changed_geometry:
+            try:
+                self.section.show(section_view(scene))
+            except PachonError as error:
+                self._say(error)
+            self._changed_geometry = False
+        if self.density.value != "1":
+            self._update(WhiskersView, lambda: whiskers_view(scene, int(self.density.value)))
+            self._show_whiskers()
+        self._show_numbers()
+        self.state_text.value = self.history.state.to_yaml()
+        self.python.value = python_text(self.bench, self.history.state)
+
+    def _update(self, kind: type, make: Callable[[], Any]) -> None:
+        """Keep a view; where it cannot be made, the last good one stays and one line says why."""
+        try:
+            self.views[kind] = make()
+        except PachonError as error:
+            self._say(error)
+
+    def _show_whiskers(self) -> None:
+        if WhiskersView in self.views:
+            view, compared = self.views[WhiskersView], self.compared.get(WhiskersView)
+            self.whiskers.show(view, self.views.get(HeightsView), compared)
+
+    def _show_numbers(self) -> None:
+        now, then = (numbers(*(v.get(k) for k in _NUMBERED)) for v in (self.views, self.compared))
+        self.table.text = number_boxes(now, then)
+
+    def _say(self, message: PachonError | str, *, error: bool = True) -> None:
+        status_text(self.status, message, error=error)
+
+    def add_to(self, document: Document) -> None:
+        """Add the roots to the document of a page."""
+        colour(self.sidebar)
+        for root in (self.sidebar, self.status, self.table, *(picture.figure for picture in self.pictures)):
+            document.add_root(root)
+        document.js_on_event(DocumentReady, CustomJS(args={"toggle": self.theme_toggle}, code=FIRST_THEME))
+
+
+_NUMBERED = (SpotsView, OpdView, WhiskersView, ImagesView)
+
+
+def _button(label: str, action: Callable[[], None], width: int = 84) -> Button:
+    button = Button(label=label, width=width)
+    button.on_click(lambda event: action())
+    return button
+
+
+def _download(label: str, text: TextAreaInput, name: str) -> Button:
+    button = Button(label=label, width=110)
+    button.js_on_click(CustomJS(args={"text": text, "name": name}, code=_DOWNLOAD))
+    return button

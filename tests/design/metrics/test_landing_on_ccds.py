@@ -1,0 +1,71 @@
+"""Analyses of rays that land on CCDs at their heights: a CCD that is lifted is a detector that is moved."""
+
+import numpy as np
+import pytest
+
+import pachon
+from pachon.core.errors import ConfigError, DomainError
+
+TELESCOPE = pachon.load_telescope("lsst_v3.3_r")
+LIFT = 20e-6
+#: All CCDs lifted alike, and the detector moved by as much.
+LIFTED = pachon.FocalPlane.flat()
+for _raft in LIFTED.camera.raft_names:
+    LIFTED = LIFTED.with_moved(_raft, dz=LIFT)
+MOVED = TELESCOPE.perturbed("Detector", shift=(0.0, 0.0, LIFT))
+#: Not in a gap between CCDs.
+FIELDS = pachon.fields_at(TELESCOPE, LIFTED.camera.centers[[94, 10]] + 1e-3)
+
+
+@pytest.mark.parametrize(
+    "analysis",
+    [
+        lambda t, **on: pachon.spots(t, FIELDS, n_pupil=5, **on).rms_radius,
+        lambda t, **on: pachon.through_focus(t, FIELDS, defocus=[0.0, 1e-5], n_pupil=5, **on).rms_radius,
+        lambda t, **on: pachon.strehl(t, FIELDS[:1], from_psf=False, n_pupil=5, **on).rms_wavefront,
+        lambda t, **on: (
+            pachon.encircled_energy(t, FIELDS, kind="geometric", n_pupil=200, radii=[5e-6, 2e-5], **on).fraction
+        ),
+    ],
+)
+def test_a_focal_plane_that_is_lifted_is_a_detector_that_is_moved(analysis):
+    # Rounding of rays that go on from one surface rather than to another.
+    np.testing.assert_allclose(analysis(TELESCOPE, focal_plane=LIFTED), analysis(MOVED), rtol=1e-6)
+    assert np.abs(analysis(TELESCOPE) / analysis(MOVED) - 1.0).max() > 1e-2
+
+
+@pytest.mark.parametrize(
+    "analysis",
+    [
+        lambda r: pachon.wavefront_zernikes(r, jmax=11).coefficients,
+        lambda r: pachon.ray_fans(r).displacement,
+        lambda r: pachon.wavefront_opds(r, grid=8).value,
+    ],
+)
+def test_a_request_takes_its_focal_plane_along(analysis):
+    flat, moved = (pachon.Request.of(t, FIELDS, 620e-9, n_pupil=4) for t in (TELESCOPE, MOVED))
+    # The CCD is its tangent plane, and paths are metres in 1e-16.
+    np.testing.assert_allclose(analysis(flat.on(LIFTED)), analysis(moved), rtol=0, atol=2e-11)
+
+
+def test_light_between_the_ccds_is_lost():
+    edge = LIFTED.camera.centers[94] + [LIFTED.camera.half_sizes[94, 0], 0.0]
+    field = pachon.fields_at(TELESCOPE, edge[None])
+    lit = pachon.spots(TELESCOPE, field, focal_plane=pachon.FocalPlane.flat()).lit_fraction
+    nominal = pachon.spots(TELESCOPE, field)
+    landing = nominal.displacement[0, 0] + nominal.reference_point[0]
+    on_ccd = LIFTED.ccd_at(*landing.T) >= 0
+    assert lit[0] == pytest.approx(nominal.weight[0, 0][on_ccd].sum(), abs=1e-12)
+    assert 0.1 < lit[0] / nominal.lit_fraction[0] < 0.9
+
+
+def test_a_focal_plane_beside_one_or_where_it_means_nothing_is_refused():
+    request = pachon.Request.of(TELESCOPE, FIELDS).on(LIFTED)
+    with pytest.raises(ConfigError, match=r"^focal_plane: given beside a Request, which has its own$"):
+        pachon.spots(request, focal_plane=LIFTED)
+    with pytest.raises(ConfigError, match=r"^focal_plane: expected none for images of targets"):
+        pachon.design.target_image(pachon.Request.of(TELESCOPE, FIELDS[0]).on(LIFTED))
+    with pytest.raises(ConfigError, match=r"^focal_plane: expected none for merit functions"):
+        pachon.design.Beams.of(request)
+    with pytest.raises(DomainError, match="focal plane"):
+        pachon.Request.of(TELESCOPE.with_design(afocal=True), FIELDS).on(LIFTED)

@@ -1,0 +1,212 @@
+"""The desk in a real browser: needs Bokeh, Playwright and Chromium (``apt install chromium``); else it is skipped."""
+
+import http.client
+import re
+import select
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from urllib.parse import urlsplit
+
+import pytest
+
+pytest.importorskip("bokeh", reason="the desk in a browser needs Bokeh: pip install 'pachon[desk]'")
+playwright = pytest.importorskip("playwright.sync_api", reason="the desk in a browser needs Playwright")
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+if BROWSER is None:
+    pytest.skip("the desk in a browser needs Chromium: apt install chromium", allow_module_level=True)
+
+from pachon.desk.bench import Bench  # noqa: E402
+from pachon.desk.run_views import KINDS, RunBench, run_numbers, run_whiskers  # noqa: E402
+from pachon.desk.views import Scene, images_view, numbers, opd_view, spots_view, whiskers_view  # noqa: E402
+
+pytestmark = pytest.mark.long
+#: Ample time for a busy machine [ms].
+PATIENCE = 120_000
+TEXT = "() => window.Bokeh?.documents[0]?.get_model_by_name('numbers')?.text ?? ''"
+
+
+@pytest.fixture(scope="module")
+def address():
+    command = [sys.executable, "-m", "pachon", "desk", "lsst_v3.3_r", "--no-browser", "--port", "5306"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server:
+        assert select.select([server.stdout], [], [], 120.0)[0]
+        line = server.stdout.readline()
+        yield re.search(r"http://127\.0\.0\.1:\d+/[-\w]{32}", line)[0]
+        server.send_signal(2)
+        rest = server.communicate(timeout=60)[0]
+    # Ctrl-C ends it, without a word.
+    assert (server.returncode, rest) == (0, "")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as program:
+        opened = program.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def new_page(address, browser):
+    """Return a function that opens the desk; nothing may go wrong on its pages, or leave this machine."""
+    pages, problems, hosts = [], [], set()
+
+    def opened(width=1300, theme="light"):
+        page = browser.new_page(viewport={"width": width, "height": 900})
+        page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.on("request", lambda request: hosts.add(urlsplit(request.url).hostname))
+        page.goto(f"{address}?theme={theme}")
+        page.wait_for_function(f"({TEXT})().includes('FWHM')", timeout=PATIENCE)
+        pages.append(page)
+        return page
+
+    yield opened
+    for page in pages:
+        page.close()
+    assert problems == []
+    assert hosts - {None} == {"127.0.0.1"}
+
+
+def shown(page):
+    """Return the numbers on the page by name, as texts."""
+    return dict(re.findall(r"opacity:.75\">([^<]+)</div><b[^>]*>([^<]+)</b>", page.evaluate(TEXT)))
+
+
+def expected(state, bench):
+    scene = Scene.of(bench, state)
+    table = numbers(spots_view(scene), opd_view(scene), whiskers_view(scene), images_view(scene))
+    return {name: f"{value:.4g}" for name, (value, _) in table.items()}
+
+
+def wait_for(page, numbers_of_python):
+    for _ in range(240):
+        if shown(page) == numbers_of_python:
+            return
+        page.wait_for_timeout(500)
+    assert shown(page) == numbers_of_python
+
+
+@pytest.mark.parametrize(("width", "theme"), [(1300, "light"), (700, "dark")])
+def test_every_picture_draws_and_fits_the_page(new_page, width, theme):
+    page = new_page(width, theme)
+    names = ["spots", "whiskers", "opd", "zernikes", "optics", "seen", "energy", "section"]
+    inside = """name => {
+        const view = [...Object.values(Bokeh.index)].find(v => v.model.name == name);
+        const canvas = view.canvas_view.primary.canvas, data = canvas.getContext('2d');
+        const pixels = new Set(new Uint32Array(data.getImageData(0, 0, canvas.width, canvas.height).data.buffer));
+        const box = view.el.getBoundingClientRect();
+        return [pixels.size, box.left, box.right];
+    }"""
+    for name in names:
+        page.wait_for_function(f"name => ({inside})(name)[0] > 5", arg=name, timeout=PATIENCE)
+        _, left, right = page.evaluate(inside, name)
+        assert 0 <= left < right <= width, name
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= width
+    assert page.evaluate("() => document.documentElement.classList.contains('dark')") == (theme == "dark")
+
+
+def test_a_slider_gives_the_numbers_of_the_python_api_and_tabs_do_not_mix(new_page):
+    bench = Bench("lsst_v3.3_r")
+    first, second = new_page(), new_page()
+    start = expected(bench.start, bench)
+    wait_for(second, start)
+    slider = first.get_by_role("slider").first
+    slider.focus()
+    for _ in range(20):
+        slider.press("ArrowRight")
+    dz = next(control for control in bench.controls if control.key == "optics.M2_dz")
+    moved = expected(replace(bench.start, optics={"M2_dz": 20 * dz.step}), bench)
+    assert moved != start
+    wait_for(first, moved)
+    assert shown(second) == start
+    # All steps of a drag are one to undo.
+    first.get_by_role("button", name="Undo").click()
+    wait_for(first, start)
+
+
+def test_what_is_impossible_is_one_line_and_the_last_good_state_stays(new_page):
+    page = new_page()
+    before = shown(page)
+    number = page.locator("input.bk-input").first
+    number.fill("1e9")
+    number.press("Enter")
+    page.wait_for_function("() => Bokeh.documents[0].get_model_by_name('status').text != ''", timeout=PATIENCE)
+    assert shown(page) == before
+
+
+def status(address, path, headers=None):
+    connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=60)
+    try:
+        connection.request("GET", path, headers=headers or {})
+        return connection.getresponse().status
+    finally:
+        connection.close()
+
+
+def test_other_addresses_and_other_origins_are_refused(address):
+    path = urlsplit(address).path
+    assert [status(address, p) for p in ("/", "/desk", path[:-1] + "~", f"/ws{path}")] == [404] * 4
+    key = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
+    key |= {"Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="}
+    assert status(address, f"{path}/ws", key | {"Origin": "http://example.org"}) == 403
+
+
+def test_a_port_that_is_taken_gives_way_to_the_next(address):
+    port = urlsplit(address).port
+    command = [sys.executable, "-m", "pachon", "desk", "lsst_v3.3_r", "--no-browser", "--port", str(port)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
+        assert select.select([server.stdout], [], [], 120.0)[0]
+        assert f":{port + 1}/" in server.stdout.readline()
+        server.send_signal(2)
+        assert server.communicate(timeout=60)[1] == f"port {port} is taken; the next free one is used\n"
+
+
+def test_an_exported_page_needs_nothing_else(browser, tmp_path):
+    target = tmp_path / "desk.html"
+    state = tmp_path / "desk.yaml"
+    bench = Bench("lsst_v3.3_r")
+    state.write_text(bench.start.with_value("optics.M2_dx", 300.0).to_yaml())
+    command = [sys.executable, "-m", "pachon", "desk", str(state), "--export", str(target)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"page: {target}\n", "")
+    page = browser.new_page()
+    requests, problems = [], []
+    page.on("request", lambda request: requests.append(request.url))
+    page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
+    page.goto(target.as_uri())
+    page.wait_for_function("() => document.querySelectorAll('.bk-Figure').length == 8", timeout=PATIENCE)
+    assert "M2_dx: 300.0" in page.content()
+    assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert problems == []
+    page.close()
+
+
+def test_the_desk_of_a_run_draws_its_stars_and_a_clicked_ccd(finished_run, browser):
+    command = [sys.executable, "-m", "pachon", "desk", str(finished_run), "--no-browser", "--port", "5386"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server:
+        assert select.select([server.stdout], [], [], 120.0)[0]
+        url = re.search(r"http\S+", server.stdout.readline())[0]
+        page, problems, hosts = browser.new_page(), [], set()
+        page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
+        page.on("request", lambda request: hosts.add(urlsplit(request.url).hostname))
+        page.goto(url)
+        page.wait_for_function(f"({TEXT})().includes('ellipticity')", timeout=PATIENCE)
+        bench = RunBench(finished_run)
+        for kind in KINDS[::-1]:
+            page.locator("select").first.select_option(kind)
+            table = run_numbers(run_whiskers(bench, replace(bench.start, kind=kind)), len(bench.ccds))
+            wait_for(page, {name: f"{value:.4g}" for name, (value, _) in table.items()})
+        page.locator("select").nth(1).select_option(list(bench.ccds)[-1])
+        page.wait_for_function(
+            "name => Object.values(Bokeh.index).some(v => v.model.title?.text?.startsWith(name))",
+            arg=list(bench.ccds)[-1],
+            timeout=PATIENCE,
+        )
+        page.close()
+        server.send_signal(2)
+        server.communicate(timeout=60)
+    assert problems == []
+    assert hosts - {None} == {"127.0.0.1"}
