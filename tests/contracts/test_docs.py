@@ -25,6 +25,8 @@ PATHS = {
     for folder in FOLDERS
     for path in sorted((DOCS / folder).glob("*.md"))
 }
+#: Pages that the build makes, as seen from the folder of the reference.
+GENERATED = ("api/index.md", "commands/index.md")
 PAGES = {name: path.read_text(encoding="utf-8") for name, path in PATHS.items()}
 BLOCK = re.compile(r"```python\n(.*?)```", flags=re.S)
 LENSES = Path(__file__).parents[1] / "data" / "zmx"
@@ -153,7 +155,7 @@ def test_the_page_of_the_focal_plane_model_runs_on_a_run(tmp_path, monkeypatch, 
 @pytest.mark.parametrize("name", PAGES)
 def test_pictures_and_links_are_there(name):
     for target in re.findall(r"\]\(([^)#:]+)\)", PAGES[name]):
-        assert (PATHS[name].parent / target).exists(), target
+        assert target in GENERATED or (PATHS[name].parent / target).exists(), target
 
 
 @pytest.mark.parametrize("name", PAGES)
