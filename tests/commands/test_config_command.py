@@ -17,6 +17,7 @@ def test_stored_names_are_those_of_the_modules():
     assert stored_names.stored_names() == stored_names.current_names()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", config_kinds.KINDS)
 def test_every_key_has_a_type_a_meaning_and_a_unit(kind):
     _, keys = keys_of(kind)
@@ -28,6 +29,7 @@ def test_every_key_has_a_type_a_meaning_and_a_unit(kind):
             assert unit_of(key)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", sorted({*config_kinds.KINDS} - {"optimization"}))
 def test_examples_are_accepted(kind):
     """All can be copied, but for the keys of a visit, which a list gives together."""

@@ -7,6 +7,7 @@ import ast
 import inspect
 import re
 import typing
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
@@ -87,11 +88,17 @@ def annotation_of(command, name):
     return str(eval(annotation, function.__globals__) if isinstance(annotation, str) else annotation)
 
 
+@lru_cache
+def tree_of(file):
+    return ast.parse(Path(file).read_text(encoding="utf-8"))
+
+
 def called_functions(command):
     """Names that a command's function uses, and the functions of its file that it calls, and so on."""
     function = inspect.unwrap(command.callback)
-    tree = ast.parse(Path(function.__code__.co_filename).read_text(encoding="utf-8"))
-    bodies = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+    bodies = {
+        node.name: node for node in tree_of(function.__code__.co_filename).body if isinstance(node, ast.FunctionDef)
+    }
     names, remaining = set(), [function.__name__]
     while remaining:
         body = bodies.pop(remaining.pop(), None)
@@ -249,6 +256,7 @@ def test_options_that_are_gone_or_wrong_say_what_to_write(arguments, words, in_f
     assert list(in_folder.iterdir()) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "arguments", ["paul_baker b.yaml", "paul_baker -o b.yaml", "--out b.yaml paul_baker", "--out=b.yaml paul_baker"]
 )
