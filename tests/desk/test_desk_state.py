@@ -1,6 +1,7 @@
 """States and views of a desk, without a browser; Bokeh is not needed."""
 
 import runpy
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from astropy import units as u
 
 import pachon
+from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, PachonError, UnknownNameError
 from pachon.desk.bench import Bench
 from pachon.desk.python_text import python_text
@@ -180,3 +182,18 @@ def test_a_lens_without_a_camera_has_radii_and_thicknesses(tmp_path):
     changed = runpy.run_path(str(path))["telescope"]
     radius = bench.nominal.surface("S1").shape.parameters["radius"]
     assert changed.surface("S1").shape.parameters["radius"] == pytest.approx(radius + 1e-4, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["desk"], "pachon desk needs Bokeh: pip install 'pachon[desk]'"),
+        (["desk", "--port", "0"], "'--port'"),
+    ],
+)
+def test_a_desk_that_cannot_open_is_one_line(arguments, message, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "bokeh", None)
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert message in err
