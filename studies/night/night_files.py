@@ -93,8 +93,8 @@ def write_night(
         maps.write(folder, stamp)
     means = {band: xi.mean_correlations(correlated[band]) for band in sorted(correlated)}
     if means:
-        meta = {"what": "correlation of g at places of the same visit, mean over visits", **stamp.meta()}
-        write_named_table(folder / CORRELATION_TABLE, xi.correlation_columns(means), meta)
+        what = "correlation of g at places of the same visit, mean over visits"
+        write_named_table(folder / CORRELATION_TABLE, xi.correlation_columns(means), {"what": what, **stamp.meta()})
     summary = {
         **stamp.meta(),
         "configuration": config.as_dict(),
