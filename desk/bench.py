@@ -72,6 +72,7 @@ class Bench:
         self.nominal: Telescope = load_telescope(model)
         self.camera: Camera | None = None if self.nominal.camera is None else load_camera(self.nominal.camera)
         self.freedoms = _freedoms(self.nominal)
+        self._drawn_plane: FocalPlane | None = None
         principal = principal_rays(self.nominal, [(0.0, 0.0)])
         self.f_number = float(principal.mean_f_number[0])
         #: Angle on the sky over length on the detector [rad/m].
@@ -189,8 +190,8 @@ class Bench:
         return FocalPlane.flat(self.camera)
 
     def _drawn(self, seed: int) -> FocalPlane:
-        if getattr(self, "_drawn_plane", None) is None or self._drawn_plane.seed != seed:
-            self._drawn_plane = FocalPlane.from_budget(self.camera, seed=seed)
+        if self._drawn_plane is None or self._drawn_plane.seed != seed:
+            self._drawn_plane = FocalPlane.from_budget(self.flat.camera, seed=seed)
         return self._drawn_plane
 
     @cached_property

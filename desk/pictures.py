@@ -318,8 +318,8 @@ class WhiskersPicture(Picture):
         key = _round_up(max([2e-3, *(float(np.nanquantile(e, 0.9)) for e in drawn)]))
         length = 0.11 * self._extent / key
         for source, shapes in ((self._whiskers, view), (self._compared, compared)):
-            same = shapes is not None
-            source.data = dict(zip(("x0", "y0", "x1", "y1"), shapes.ends(length), strict=True)) if same else _NO_ENDS
+            ends = _NO_ENDS if shapes is None else dict(zip(_NO_ENDS, shapes.ends(length), strict=True))
+            source.data = ends
         x0, y0 = self._center[0] - self._extent, self._center[1] - 1.3 * self._extent
         self._key.data = {"x0": [x0], "y0": [y0], "x1": [x0 + length * key], "y1": [y0]}
         self._key_text.data = {"x": [x0], "y": [y0], "text": [f"e = {100 * key:.3g} %"]}
@@ -357,7 +357,7 @@ class WhiskersPicture(Picture):
         self._label.glyph.text_color = THEMES[theme]["text"]
 
 
-_NO_ENDS: dict[str, list[float]] = {"x0": [], "y0": [], "x1": [], "y1": []}
+_NO_ENDS: dict[str, Any] = {"x0": [], "y0": [], "x1": [], "y1": []}
 
 
 def diverging_palette() -> list[str]:

@@ -29,6 +29,7 @@ from .pictures import (
     EnergyPicture,
     ImagePicture,
     OpdPicture,
+    Picture,
     SectionPicture,
     SpotsPicture,
     WhiskersPicture,
@@ -109,8 +110,8 @@ class Session:
         self.seen = ImagePicture("seen", "Image of the star, with the atmosphere")
         self.whiskers = WhiskersPicture(extent, tile, heights=camera is not None)
         self.section = SectionPicture()
-        self.pictures = (self.spots, self.whiskers, self.opd, self.zernikes, self.optics, self.seen, self.energy)
-        self.pictures = (*self.pictures, self.section)
+        first = (self.spots, self.whiskers, self.opd, self.zernikes)
+        self.pictures: tuple[Picture, ...] = (*first, self.optics, self.energy, self.section, self.seen)
 
     def paint(self, theme: str) -> None:
         """Colour the pictures by a theme."""

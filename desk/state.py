@@ -93,9 +93,9 @@ class DeskState:
         if section == "field_deg":
             x, y = self.field_deg
             return replace(self, field_deg=(value, y) if name == "x" else (x, value))
-        if name:
-            return replace(self, **{section: {**getattr(self, section), name: value}})
-        return replace(self, **{section: int(value) if section == "seed" else value})
+        whole = int(value) if section == "seed" else value
+        changes: dict[str, Any] = {section: {**getattr(self, section), name: value} if name else whole}
+        return replace(self, **changes)
 
     @property
     def total_optics(self) -> dict[str, float]:

@@ -185,7 +185,8 @@ def _ray_whiskers(scene: Scene, places: np.ndarray, star_fields: np.ndarray) -> 
         norm = xx + yy + 2.0 * root
         e1, e2 = (xx - yy) / norm, 2.0 * xy / norm
     method = "Whiskers: second moments of rays" + " and seeing" * (air > 0)
-    return WhiskersView(*(places.T * 1e3), e1, e2, FWHM * np.sqrt(root), method)
+    x_mm, y_mm = places.T * 1e3
+    return WhiskersView(x_mm, y_mm, e1, e2, FWHM * np.sqrt(root), method)
 
 
 def _weighted_whiskers(scene: Scene, places: np.ndarray, star_fields: np.ndarray) -> WhiskersView:
@@ -200,7 +201,8 @@ def _weighted_whiskers(scene: Scene, places: np.ndarray, star_fields: np.ndarray
     air = scene.atmosphere is not None
     e1, e2, size = (moments.g1, moments.g2, moments.sigma) if air else (moments.e1, moments.e2, moments.size)
     method = "Whiskers: adaptive moments" if air else "Whiskers: optics, weight of 0.3 arcsec"
-    return WhiskersView(*(places.T * 1e3), e1, e2, FWHM * size / ARCSEC, method)
+    x_mm, y_mm = places.T * 1e3
+    return WhiskersView(x_mm, y_mm, e1, e2, FWHM * size / ARCSEC, method)
 
 
 def stamps_of(scene: Scene) -> Stamps:

@@ -251,8 +251,9 @@ class FocalPlane(HeightMap):
         DomainError
             If a factor is not finite, that of a term is negative, or the heights were not drawn from a budget.
         """
-        by_term = factors if isinstance(factors, Mapping) else {}
-        for name, value in (by_term or {"factors": factors}).items():
+        by_term: Mapping[str, float] = factors if isinstance(factors, Mapping) else {}
+        values = by_term if isinstance(factors, Mapping) else {"factors": factors}
+        for name, value in values.items():
             if not np.isfinite(value) or (by_term and value < 0):
                 raise DomainError(f"{name} = {value!r}: expected a finite factor{', not negative' if by_term else ''}")
         if not isinstance(factors, Mapping):

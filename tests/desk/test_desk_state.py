@@ -157,6 +157,7 @@ def test_light_that_does_not_arrive_is_one_line():
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("state", [FULL, BENCH.start])
 def test_the_python_program_prints_the_numbers_of_the_desk(state, capsys, tmp_path):
     path = tmp_path / "desk.py"
