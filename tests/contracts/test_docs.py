@@ -11,8 +11,10 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import pachon
+from pachon.commands.cli import app
 from pachon.models.io.bundled import DATA
 from pachon.reconstruction.psf_model.model import PsfModel
 
@@ -41,6 +43,7 @@ WITH_FILES = {
     "focal_plane_psf.md",
     "piff_files.md",
     "first_run.md",
+    "own_telescope.md",
 }
 #: Pages whose examples need another package, and of those the ones that take seconds.
 PEERS = {"batoid.md": "batoid", "from_galsim.md": "galsim", "galsim.md": "galsim", "from_piff.md": "piff"}
@@ -100,6 +103,22 @@ def check_shown(name):
             assert words.split() == expected_words.split()
             # Processors differ in last digits alone, and printed roundings may flip.
             np.testing.assert_allclose(numbers, expected, rtol=0.2, atol=2e-3)
+
+
+@pytest.mark.long
+def test_the_page_of_an_own_telescope_runs_on_its_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command = re.search(r"^pachon (new .*)$", PAGES["own_telescope.md"], flags=re.M)[1]
+    assert CliRunner().invoke(app, command.split()).exit_code == 0
+    media, *lens = re.findall(r"^(media: .*|  - {name: C1.*)$", PAGES["own_telescope.md"], flags=re.M)
+    text = (tmp_path / "corrected.yaml").read_text(encoding="utf-8").replace("surfaces:", f"{media}\nsurfaces:")
+    detector = next(line for line in text.splitlines() if "Detector" in line)
+    focused = detector.replace("z: -0.25,", "z: -0.252737,")
+    text = text.replace(detector, "\n".join([*lens, focused]))
+    (tmp_path / "corrected.yaml").write_text(text, encoding="utf-8")
+    assert CliRunner().invoke(app, ["validate", "corrected.yaml"]).exit_code == 0
+    check_shown("own_telescope.md")
+    assert (tmp_path / "my_psfs.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.slow
