@@ -31,8 +31,8 @@ _HEADINGS = ("key", "default", "values", "meaning")
 
 @app.command("config")
 def config_command(
-    key: Annotated[
-        str | None,
+    words: Annotated[
+        list[str] | None,
         names(completion.config_keys, metavar="KEY", help="Kind, section or key: run.psf.engine.", kind=Argument),
     ] = None,
     table: TableFile = None,
@@ -50,7 +50,9 @@ def config_command(
     - `pachon config run.atmosphere`: a section
     - `pachon config sweep --json`
     """
-    if key is None:
+    # `run focal_plane.budget` is as good as `run.focal_plane.budget`.
+    key = ".".join(words or ())
+    if not key:
         kinds = _kind_rows()
         write_rows(kinds, table)
         if as_json:

@@ -114,3 +114,12 @@ def test_settings_are_those_of_a_file(in_folder):
 def test_a_camera_has_no_keys(name, in_folder, capsys):
     assert main(["camera", name, "--set", "seed=3"]) == 2
     assert f"--set: expected a configuration in place of {name}" in capsys.readouterr().err
+
+
+def test_kind_and_key_may_be_two_words(capsys):
+    explanations = []
+    for words in (["run.focal_plane.budget"], ["run", "focal_plane.budget"]):
+        assert main(["config", *words]) == 0
+        explanations.append(capsys.readouterr().out)
+    assert explanations[0] == explanations[1]
+    assert "focal_plane" in explanations[0]

@@ -10,7 +10,7 @@ from ...core.units import require_positive
 from .layer_screens import screen_samples
 
 #: Default cut-off in units of 1/r0 [rad/m]. Of 1.0, 1.2, 1.4 and 2.0 this brings the fast PSF engine's ellipticities
-#: nearest to the wave engine's (docs/evidence/accuracy.md); beyond it geometric optics makes the image too wide.
+#: nearest to the wave engine's (docs/evidence/engines.md); beyond it geometric optics makes the image too wide.
 DEFAULT_CUTOFF = 1.4
 
 
