@@ -314,7 +314,7 @@ def test_images_that_lack_something_are_one_line(field, tmp_path, capsys):
         (("--pixel-scale", "0.2"), "no gain"),
         (("--pixel-scale", "-1"), "pixel_scale"),
         (("--pixel-scale", "0.2", "--gain", "0"), "gain = 0"),
-        (("--weight-kind", "x"), "weight_kind = x: expected one of weight, variance, rms"),
+        (("--weight-kind", "x"), "--weight-kind = 'x': expected one of weight, variance, rms"),
         (("--extension", "N4"), "extension = N4: expected one of 0"),
         (("--psf", "x.fits", "--recipe", "paper"), "expected none with --psf"),
         (("--psf", "x.fits", "--model", "focal_plane"), "--psf: expected with --model ccd alone"),
