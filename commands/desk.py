@@ -22,8 +22,8 @@ def desk_command(
         str,
         names(
             completion.either(completion.bundled_models, completion.files(*completion.LENSES)),
-            metavar="MODEL|FILE|RUN",
-            help="Bundled telescope, its file, a state that a desk saved (.yaml), or the folder of a run.",
+            metavar="MODEL|FILE|RUN|SWEEP",
+            help="Bundled telescope, its file, a state that a desk saved (.yaml), the folder of a run, or a sweep.",
             kind=typer.Argument,
         ),
     ] = "lsst_v3.3_r",
@@ -38,6 +38,7 @@ def desk_command(
     Bodies, bending modes, radii of lenses, heights of CCDs, wavelength, field and seeing have sliders; spots, OPD,
     Zernikes, images, encircled energy, whiskers and the layout follow. States are undone, compared, saved and loaded.
     The folder of a run shows its stars in place of a telescope: noise-free, observed, model and residuals, CCD by CCD.
+    The store of a sweep shows its points: plots with one selection, effects of the parameters, points that open.
     The page is served to this machine alone, at an address with a token, until Ctrl-C. It needs `pachon[desk]`.
 
     **Examples**
@@ -47,6 +48,7 @@ def desk_command(
     - `pachon desk my_lens.zmx`
     - `pachon desk desk.yaml`: a state that was saved
     - `pachon desk pachon_run`: the stars of a run: whiskers, stamps, residuals and correlations
+    - `pachon desk heights.sweep`: the points of a sweep
     - `pachon desk desk.yaml --export desk.html`: one page that needs no network
     """
     from ..desk.opened import open_desk

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.arguments import check_arguments
-from ..core.errors import ConfigError, DomainError
+from ..core.errors import ConfigError, DomainError, PachonError
 from ..models.telescope import Telescope
 
 if TYPE_CHECKING:
@@ -20,9 +20,12 @@ if TYPE_CHECKING:
     from .bench import Bench
     from .page import DeskSession
     from .state import DeskState
+    from .sweep_views import SweepBench
 
 #: Height of a desk in a notebook [pixels].
 _HEIGHT = 860
+#: Digits of the number of a point, at most.
+_DIGITS = 12
 
 
 class Desk:
@@ -97,20 +100,20 @@ class Desk:
 
 @check_arguments
 def open_desk(source: str | os.PathLike[str] | Telescope = "lsst_v3.3_r") -> Desk:
-    """Open the live views of a telescope or run.
+    """Open the live views of a telescope, run or sweep.
 
     Parameters
     ----------
     source : str, path or Telescope
-        Bundled telescope, its file, a state that a desk saved, the folder of a run, or a telescope. States of the
-        latter name its file ``NAME.yaml``, which :func:`~pachon.save_telescope` writes.
+        Bundled telescope, its file, a state that a desk saved, the folder of a run, the store of a sweep, or a
+        telescope. States of the latter name its file ``NAME.yaml``, which :func:`~pachon.save_telescope` writes.
 
     Raises
     ------
     ConfigError
         If Bokeh is missing, or the file of a state is wrong.
     DomainError, ProductError, UnknownNameError
-        If the source is no telescope, state or run.
+        If the source is no telescope, state, run or sweep.
 
     Examples
     --------
@@ -125,16 +128,39 @@ def open_desk(source: str | os.PathLike[str] | Telescope = "lsst_v3.3_r") -> Des
     from .run_views import RunBench
     from .session import Session
     from .state import is_state_file
+    from .sweep_views import SweepBench, is_store
 
     if not isinstance(source, Telescope) and Path(source).is_dir():
         run = RunBench(Path(source))
         return Desk(run.folder.resolve().name, lambda document: RunSession(run, document))
+    if not isinstance(source, Telescope) and is_store(Path(source)):
+        sweep = SweepBench(Path(source))
+        return Desk(sweep.table.name, lambda document: _sweep_session(sweep, document))
     if isinstance(source, Telescope) or not is_state_file(Path(source)):
         bench = Bench(source if isinstance(source, Telescope) else os.fspath(source))
         state = bench.start
     else:
         bench, state = _loaded(Path(source))
     return Desk(bench.nominal.name, lambda document: Session(bench, state, document))
+
+
+def _sweep_session(sweep: SweepBench, document: Document | None) -> DeskSession:
+    """Return the session of a sweep, or of the point that the address of the page asks for."""
+    from .session import Session
+    from .sweep_session import SweepSession
+
+    context = None if document is None else document.session_context
+    request = None if context is None else context.request
+    number = [] if request is None else request.arguments.get("point", [])
+    if not number:
+        return SweepSession(sweep, document)
+    try:
+        bench, state = sweep.opened(int(number[0][:_DIGITS]))
+        return Session(bench, state, document)
+    except PachonError as error:
+        return SweepSession(sweep, document, str(error))
+    except ValueError:
+        return SweepSession(sweep, document, "point: expected a whole number")
 
 
 def _loaded(path: Path) -> tuple[Bench, DeskState]:

@@ -14,9 +14,10 @@ from jinja2 import ChoiceLoader, Environment, FileSystemLoader, Template
 from ..core.files import write_bytes
 from .run_session import RunSession
 from .session import Session
+from .sweep_session import SweepSession
 
 #: A session of any kind of page.
-DeskSession = Session | RunSession
+DeskSession = Session | RunSession | SweepSession
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
