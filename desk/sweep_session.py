@@ -8,7 +8,7 @@ import numpy as np
 from bokeh.document import Document
 from bokeh.events import DocumentReady
 from bokeh.layouts import column
-from bokeh.models import Button, ColumnDataSource, CustomJS, FactorRange, HoverTool, Select, Span, Spinner
+from bokeh.models import Button, ColumnDataSource, CustomJS, FixedTicker, HoverTool, Select, Span, Spinner
 from bokeh.models.tools import BoxSelectTool, TapTool
 
 from ..core.errors import PachonError
@@ -54,19 +54,21 @@ class TornadoPicture(Picture):
 
     def __init__(self) -> None:
         super().__init__("tornado", "", "", "", square=False)
-        self.figure.y_range = FactorRange()
-        self.source = ColumnDataSource({"name": [], "low": [], "high": [], "range": []})
-        low = self.figure.hbar("name", 0.62, "low", source=self.source, color=ORANGE, alpha=0.8)
-        high = self.figure.hbar("name", 0.62, "high", source=self.source, color=BLUE, alpha=0.8)
+        self.source = ColumnDataSource({"row": [], "name": [], "low": [], "high": [], "range": []})
+        low = self.figure.hbar("row", 0.62, "low", source=self.source, color=ORANGE, alpha=0.8)
+        high = self.figure.hbar("row", 0.62, "high", source=self.source, color=BLUE, alpha=0.8)
         self.figure.add_layout(Span(location=0.0, dimension="height", line_color=GREEN, line_dash="dashed"))
         tips = [("", "@name"), ("values", "@range"), ("below nominal", "@low"), ("above, or correlation", "@high")]
         self.figure.add_tools(HoverTool(renderers=[low, high], tooltips=tips))
 
     def show(self, view: TornadoView) -> None:
         """Draw the bars, the largest at the top."""
-        self.figure.y_range.factors = list(view.parameters)
+        names, rows = list(view.parameters), list(range(len(view.parameters)))
         ranges = list(view.ranges)
-        self.source.data = {"name": list(view.parameters), "low": view.low, "high": view.high, "range": ranges}
+        self.source.data = {"row": rows, "name": names, "low": view.low, "high": view.high, "range": ranges}
+        axis = self.figure.yaxis[0]
+        axis.ticker = FixedTicker(ticks=rows)
+        axis.major_label_overrides = dict(zip(rows, names, strict=True))
         self.figure.xaxis.axis_label = view.axis
         self.figure.title.text = "Effects of the parameters"
 

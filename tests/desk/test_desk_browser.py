@@ -6,6 +6,7 @@ import select
 import shutil
 import subprocess
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
 from urllib.parse import urlsplit
 
@@ -215,10 +216,23 @@ def test_the_desk_of_a_run_draws_its_stars_and_a_clicked_ccd(finished_run, brows
     assert hosts - {None} == {"127.0.0.1"}
 
 
+@contextmanager
+def ended(server):
+    """End a server at the end of a test, one that fails too."""
+    try:
+        yield
+    finally:
+        server.send_signal(2)
+        server.communicate(timeout=60)
+
+
 def test_a_box_in_one_plot_of_a_sweep_selects_in_all_and_a_point_opens(browser, tmp_path):
     path = store_of(tmp_path)
     command = [sys.executable, "-m", "pachon", "desk", str(path), "--no-browser", "--port", "5446"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server:
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server,
+        ended(server),
+    ):
         assert select.select([server.stdout], [], [], 120.0)[0]
         url = re.search(r"http\S+", server.stdout.readline())[0]
         context = browser.new_context(viewport={"width": 1300, "height": 900})
@@ -255,7 +269,5 @@ def test_a_box_in_one_plot_of_a_sweep_selects_in_all_and_a_point_opens(browser, 
         page.goto(f"{url}?point=x")
         page.wait_for_selector("text=expected a whole number", timeout=PATIENCE)
         context.close()
-        server.send_signal(2)
-        server.communicate(timeout=60)
     assert problems == []
     assert hosts - {None} == {"127.0.0.1"}

@@ -130,4 +130,6 @@ def test_plots_are_linked_and_a_selection_sets_the_point(path):
     np.testing.assert_array_equal(session.source.data["metric"], session.bench.metrics["rms_e"])
     assert shown[0].yaxis[0].axis_label.startswith("rms_e")
     document = pachon.open_desk(path).document()
+    tornado = document.get_model_by_name("tornado")
+    assert tornado.yaxis[0].major_label_overrides == {0: "M2.rx_urad", 1: "M2.dz_um"}
     assert {"tornado", "x0", "x1", "other"} <= {root.name for root in document.roots}
