@@ -10,6 +10,7 @@ from bokeh.events import DocumentReady
 from bokeh.layouts import column
 from bokeh.models import Button, ColumnDataSource, CustomJS, FixedTicker, HoverTool, Select, Span, Spinner
 from bokeh.models.tools import BoxSelectTool, TapTool
+from bokeh.transform import dodge
 
 from ..core.errors import PachonError
 from .pictures import BLUE, GREEN, GREY, ORANGE, Picture
@@ -55,8 +56,8 @@ class TornadoPicture(Picture):
     def __init__(self) -> None:
         super().__init__("tornado", "", "", "", square=False)
         self.source = ColumnDataSource({"row": [], "name": [], "low": [], "high": [], "range": []})
-        low = self.figure.hbar("row", 0.62, "low", source=self.source, color=ORANGE, alpha=0.8)
-        high = self.figure.hbar("row", 0.62, "high", source=self.source, color=BLUE, alpha=0.8)
+        low = self.figure.hbar(dodge("row", -0.16), 0.3, "low", source=self.source, color=ORANGE, alpha=0.8)
+        high = self.figure.hbar(dodge("row", 0.16), 0.3, "high", source=self.source, color=BLUE, alpha=0.8)
         self.figure.add_layout(Span(location=0.0, dimension="height", line_color=GREEN, line_dash="dashed"))
         tips = [("", "@name"), ("values", "@range"), ("below nominal", "@low"), ("above, or correlation", "@high")]
         self.figure.add_tools(HoverTool(renderers=[low, high], tooltips=tips))
