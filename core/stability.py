@@ -59,6 +59,7 @@ PROVISIONAL = frozenset(
         "pachon.models.corner_focal_plane",
         "pachon.models.corner_sensors",
         "pachon.models.parabasal_optics",
+        "pachon.open_desk",
         "pachon.pipeline.EdgeRolloff",
         "pachon.pipeline.StarDefects",
         "pachon.pipeline.TreeRings",

@@ -67,9 +67,10 @@ class Control:
 class Bench:
     """A telescope with all that a desk varies; what does not depend on the state is computed once."""
 
-    def __init__(self, model: str) -> None:
-        self.model = model
-        self.nominal: Telescope = load_telescope(model)
+    def __init__(self, model: str | Telescope) -> None:
+        # States of a telescope that was never a file name the one that it would be saved as.
+        self.model = f"{model.name}.yaml" if isinstance(model, Telescope) else model
+        self.nominal: Telescope = model if isinstance(model, Telescope) else load_telescope(model)
         self.camera: Camera | None = None if self.nominal.camera is None else load_camera(self.nominal.camera)
         self.freedoms = _freedoms(self.nominal)
         self._drawn_plane: FocalPlane | None = None

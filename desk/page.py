@@ -14,7 +14,10 @@ from jinja2 import ChoiceLoader, Environment, FileSystemLoader, Template
 from ..core.files import write_bytes
 from .run_session import RunSession
 from .session import Session
+from .sweep_session import SweepSession
 
+#: A session of any kind of page.
+DeskSession = Session | RunSession | SweepSession
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
@@ -25,7 +28,7 @@ def template() -> Template:
     return Environment(loader=loader, autoescape=True).get_template("desk.html")
 
 
-def page_names(session: Session | RunSession, *, live: bool) -> dict[str, Any]:
+def page_names(session: DeskSession, *, live: bool) -> dict[str, Any]:
     """Return what the template fills in."""
     names = [str(picture.figure.name) for picture in session.pictures]
     return {
@@ -38,7 +41,7 @@ def page_names(session: Session | RunSession, *, live: bool) -> dict[str, Any]:
     }
 
 
-def show_in(session: Session | RunSession, document: Document) -> None:
+def show_in(session: DeskSession, document: Document) -> None:
     """Make a document the page of a session."""
     document.template = template()
     document.title = session.title
@@ -46,7 +49,7 @@ def show_in(session: Session | RunSession, document: Document) -> None:
     session.add_to(document)
 
 
-def export_page(session: Session | RunSession, path: Path) -> None:
+def export_page(session: DeskSession, path: Path) -> None:
     """Write the pictures and numbers of a session as one page that needs no network."""
     pictures = [picture.figure for picture in session.pictures if picture.figure.visible]
     names = page_names(session, live=False)

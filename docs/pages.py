@@ -30,6 +30,7 @@ LAYERS = {
     "imaging": ("Images of CCDs", "World coordinates, scenes, exposures, catalogues of images."),
     "studies": ("Studies", "Made of many runs: sweeps, baselines, shims, alignment, visits."),
     "": ("GalSim", "Needs `pip install 'pachon[galsim]'`."),
+    "desk": ("The desk", "Live views in a browser and in notebooks; needs `pip install 'pachon[desk]'`."),
     "testing": ("Tests of your own", "For the tests of your own project."),
     "core": ("Errors", "Every error of pachon is a `PachonError`: one line, with `file` and `key` as fields."),
 }

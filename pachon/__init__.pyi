@@ -35,6 +35,7 @@ from .design.optimize.optimize import optimize as optimize
 from .design.optimize.sensitivity import sensitivity as sensitivity
 from .design.report.report import design_report as design_report
 from .design.tolerancing.monte_carlo import monte_carlo as monte_carlo
+from .desk.opened import open_desk as open_desk
 from .imaging.draw import Window as Window
 from .imaging.exposure import Exposure as Exposure
 from .imaging.image_formats.load import load_image as load_image

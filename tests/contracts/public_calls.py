@@ -474,6 +474,7 @@ def calls(folder):
         "load_sweep": (studies.load_sweep, {"path": m.folder / "none.yaml"}),
         "load_sweep_table": (studies.load_sweep_table, {"path": m.folder / "none.db"}),
         "run_sweep": (pachon.run_sweep, {"sweep": m.sweep, "path": m.file, "execution": m.execution}),
+        "open_desk": (pachon.open_desk, {"source": "none"}),
         "run": (pachon.run, {"config": m.config, "folder": m.folder / "none", "strict": False,
                              "execution": m.execution}),
         "simulate_images": (pachon.simulate_images, {"config": imaging.ImagesConfig(run=m.config),

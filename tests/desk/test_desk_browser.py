@@ -6,6 +6,7 @@ import select
 import shutil
 import subprocess
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
 from urllib.parse import urlsplit
 
@@ -17,8 +18,11 @@ BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "
 if BROWSER is None:
     pytest.skip("the desk in a browser needs Chromium: apt install chromium", allow_module_level=True)
 
+from test_desk_sweep import store_of  # noqa: E402
+
 from pachon.desk.bench import Bench  # noqa: E402
 from pachon.desk.run_views import KINDS, RunBench, run_numbers, run_whiskers  # noqa: E402
+from pachon.desk.sweep_views import SweepBench  # noqa: E402
 from pachon.desk.views import Scene, images_view, numbers, opd_view, spots_view, whiskers_view  # noqa: E402
 
 pytestmark = pytest.mark.long
@@ -208,5 +212,62 @@ def test_the_desk_of_a_run_draws_its_stars_and_a_clicked_ccd(finished_run, brows
         page.close()
         server.send_signal(2)
         server.communicate(timeout=60)
+    assert problems == []
+    assert hosts - {None} == {"127.0.0.1"}
+
+
+@contextmanager
+def ended(server):
+    """End a server at the end of a test, one that fails too."""
+    try:
+        yield
+    finally:
+        server.send_signal(2)
+        server.communicate(timeout=60)
+
+
+def test_a_box_in_one_plot_of_a_sweep_selects_in_all_and_a_point_opens(browser, tmp_path):
+    path = store_of(tmp_path)
+    command = [sys.executable, "-m", "pachon", "desk", str(path), "--no-browser", "--port", "5446"]
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server,
+        ended(server),
+    ):
+        assert select.select([server.stdout], [], [], 120.0)[0]
+        url = re.search(r"http\S+", server.stdout.readline())[0]
+        context = browser.new_context(viewport={"width": 1300, "height": 900})
+        page, problems, hosts = context.new_page(), [], set()
+        context.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
+        context.on("request", lambda request: hosts.add(urlsplit(request.url).hostname))
+        page.goto(url)
+        page.wait_for_function(f"({TEXT})().includes('fwhm')", timeout=PATIENCE)
+        page.wait_for_function("() => document.querySelectorAll('.bk-Figure').length == 4", timeout=PATIENCE)
+        bench = SweepBench(path)
+        # A box over the left half of the first plot.
+        frame = page.evaluate("""() => {
+            const view = Object.values(Bokeh.index).find(v => v.model.name == 'x0');
+            const canvas = view.canvas_view.el.getBoundingClientRect(), inner = view.frame.bbox;
+            return [canvas.left + inner.left, canvas.top + inner.top, inner.width, inner.height];
+        }""")
+        left, top, width, height = frame
+        page.mouse.move(left + 2, top + 2)
+        page.mouse.down()
+        page.mouse.move(left + 0.3 * width, top + 0.9 * height, steps=4)
+        page.mouse.move(left + 0.3 * width, top + height - 2)
+        page.mouse.up()
+        [row] = [i for i, x in enumerate(bench.parameters["M2.dz_um"]) if x == -10]
+        table = bench.numbers("fwhm_arcsec", [row])
+        wait_for(page, {name: f"{value:.4g}" for name, (value, _) in table.items()})
+        number = int(bench.table.number[row])
+        chosen = "() => Bokeh.documents[0].get_model_by_name('x1').renderers[0].data_source.selected.indices"
+        assert page.evaluate(chosen) == [row]
+        with context.expect_page() as opening:
+            page.get_by_role("button", name="Open this telescope").click()
+        opened = opening.value
+        assert opened.url.endswith(f"?point={number}")
+        wait_for(opened, expected(bench.opened(number)[1], bench.opened(number)[0]))
+        page.goto(f"{url}?point=x")
+        page.wait_for_selector("text=expected a whole number", timeout=PATIENCE)
+        context.close()
     assert problems == []
     assert hosts - {None} == {"127.0.0.1"}

@@ -1,0 +1,180 @@
+"""Open a desk from Python: its document, its page in a file, and its server for notebooks."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Callable
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..core.arguments import check_arguments
+from ..core.errors import ConfigError, DomainError, PachonError
+from ..models.telescope import Telescope
+
+if TYPE_CHECKING:
+    from bokeh.document import Document
+    from bokeh.server.server import Server
+
+    from .bench import Bench
+    from .page import DeskSession
+    from .state import DeskState
+    from .sweep_views import SweepBench
+
+#: Height of a desk in a notebook [pixels].
+_HEIGHT = 860
+#: Digits of the number of a point, at most.
+_DIGITS = 12
+
+
+class Desk:
+    """A desk that is open: notebooks show it live.
+
+    Its server listens at this machine alone, at an address with a token, from when a notebook first shows it until
+    :meth:`close`. It draws between the cells, while the kernel is idle.
+    """
+
+    def __init__(self, name: str, new_session: Callable[[Document | None], DeskSession]) -> None:
+        self.name, self._new_session = name, new_session
+        self._server: Server | None = None
+        self._address = ""
+
+    def show_in(self, document: Document) -> None:
+        """Make a document the page of a new session."""
+        from .page import show_in
+
+        show_in(self._new_session(document), document)
+
+    def document(self) -> Document:
+        """Return a Bokeh document with all pictures and controls; no browser is needed."""
+        from bokeh.document import Document
+
+        document = Document()
+        self.show_in(document)
+        return document
+
+    def export(self, path: str | os.PathLike[str]) -> None:
+        """Write a page that needs no network and no server."""
+        from .page import export_page
+
+        export_page(self._new_session(None), Path(path))
+
+    @property
+    def address(self) -> str:
+        """Address of the live page; the server starts when it is first asked for.
+
+        Raises
+        ------
+        DomainError
+            Where no event loop runs, as one does in notebooks.
+        """
+        from .server import open_server
+
+        if self._server is None:
+            try:
+                asyncio.get_running_loop()
+            except RuntimeError:
+                raise DomainError("no event loop runs: expected a notebook; `pachon desk` serves without one") from None
+            self._server, self._address = open_server(self.show_in)
+        return self._address
+
+    def close(self) -> None:
+        """End the server."""
+        if self._server is not None:
+            self._server.stop()
+            self._server, self._address = None, ""
+
+    def __repr__(self) -> str:
+        return f"Desk({self.name!r})"
+
+    def _repr_html_(self) -> str:
+        """Return the frame that notebooks show."""
+        try:
+            address = self.address
+        except DomainError as error:
+            return f"<p>{escape(repr(self))}: {escape(str(error))}</p>"
+        style = f"width:100%;height:{_HEIGHT}px;border:0"
+        return f'<iframe src="{escape(address)}" title="desk of {escape(self.name)}" style="{style}"></iframe>'
+
+
+@check_arguments
+def open_desk(source: str | os.PathLike[str] | Telescope = "lsst_v3.3_r") -> Desk:
+    """Open the live views of a telescope, run or sweep.
+
+    Parameters
+    ----------
+    source : str, path or Telescope
+        Bundled telescope, its file, a state that a desk saved, the folder of a run, the store of a sweep, or a
+        telescope. States of the latter name its file ``NAME.yaml``, which :func:`~pachon.save_telescope` writes.
+
+    Raises
+    ------
+    ConfigError
+        If Bokeh is missing, or the file of a state is wrong.
+    DomainError, ProductError, UnknownNameError
+        If the source is no telescope, state, run or sweep.
+
+    Examples
+    --------
+    In a notebook the last line of a cell shows the desk: ``pachon.open_desk("hsc")``.
+    """
+    try:
+        import bokeh  # noqa: F401 - the extra
+    except ImportError:
+        raise ConfigError("pachon desk needs Bokeh: pip install 'pachon[desk]'") from None
+    from .bench import Bench
+    from .run_session import RunSession
+    from .run_views import RunBench
+    from .session import Session
+    from .state import is_state_file
+    from .sweep_views import SweepBench, is_store
+
+    if not isinstance(source, Telescope) and Path(source).is_dir():
+        run = RunBench(Path(source))
+        return Desk(run.folder.resolve().name, lambda document: RunSession(run, document))
+    if not isinstance(source, Telescope) and is_store(Path(source)):
+        sweep = SweepBench(Path(source))
+        return Desk(sweep.table.name, lambda document: _sweep_session(sweep, document))
+    if isinstance(source, Telescope) or not is_state_file(Path(source)):
+        bench = Bench(source if isinstance(source, Telescope) else os.fspath(source))
+        state = bench.start
+    else:
+        bench, state = _loaded(Path(source))
+    return Desk(bench.nominal.name, lambda document: Session(bench, state, document))
+
+
+def _sweep_session(sweep: SweepBench, document: Document | None) -> DeskSession:
+    """Return the session of a sweep, or of the point that the address of the page asks for."""
+    from .session import Session
+    from .sweep_session import SweepSession
+
+    context = None if document is None else document.session_context
+    request = None if context is None else context.request
+    number = [] if request is None else request.arguments.get("point", [])
+    if not number:
+        return SweepSession(sweep, document)
+    try:
+        bench, state = sweep.opened(int(number[0][:_DIGITS]))
+        return Session(bench, state, document)
+    except PachonError as error:
+        return SweepSession(sweep, document, str(error))
+    except ValueError:
+        return SweepSession(sweep, document, "point: expected a whole number")
+
+
+def _loaded(path: Path) -> tuple[Bench, DeskState]:
+    """Return the bench and the state of a file that a desk saved."""
+    from dataclasses import replace
+
+    from ..core.errors import error_context
+    from .bench import Bench
+    from .state import DeskState
+
+    state = DeskState.from_file(path)
+    beside = path.parent / state.model
+    if beside.is_file():
+        state = replace(state, model=str(beside))
+    with error_context(file=path):
+        bench = Bench(state.model)
+        return bench, bench.check(state)
