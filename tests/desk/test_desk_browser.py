@@ -190,7 +190,10 @@ def test_an_exported_page_needs_nothing_else(browser, tmp_path):
 
 def test_the_desk_of_a_run_draws_its_stars_and_a_clicked_ccd(finished_run, browser):
     command = [sys.executable, "-m", "pachon", "desk", str(finished_run), "--no-browser", "--port", "5386"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server:
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server,
+        ended(server),
+    ):
         assert select.select([server.stdout], [], [], 120.0)[0]
         url = re.search(r"http\S+", server.stdout.readline())[0]
         page, problems, hosts = browser.new_page(), [], set()
@@ -210,8 +213,6 @@ def test_the_desk_of_a_run_draws_its_stars_and_a_clicked_ccd(finished_run, brows
             timeout=PATIENCE,
         )
         page.close()
-        server.send_signal(2)
-        server.communicate(timeout=60)
     assert problems == []
     assert hosts - {None} == {"127.0.0.1"}
 

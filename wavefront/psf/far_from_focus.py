@@ -55,5 +55,6 @@ def check_stamp(optics: PupilOptics, plane: ImagePlane) -> None:
         x, y = np.rad2deg(optics.fields[star])
         raise DomainError(
             f"stamps: size = {plane.size}: {100.0 * lost[star]:.0f} % of the light of the star at field ({x:.4g}, "
-            f"{y:.4g}) deg falls beside the stamp; expected at least {needed} pixels"
+            f"{y:.4g}) deg falls beside the stamp; expected at least {needed} pixels, or a telescope in focus "
+            "(pachon focus)"
         )
