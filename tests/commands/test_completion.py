@@ -52,7 +52,7 @@ def completed(path, name, typed="", **values):
         ("operands", "--operand", "EFF", ["EFFL"]),
         ("run", "--set", "psf.engine=", [f"psf.engine={w}" for w in ("fast", "wave", "long_exposure", "statistical")]),
         ("run", "--set", "psf.stamp", ["psf.stamp="]),
-        ("config", "key", "align.control.g", ["align.control.gain"]),
+        ("config", "words", "align.control.g", ["align.control.gain"]),
         ("sweep run", "--example", "", ["table1", "table1_small"]),
         ("camera", "heights", "com", ["comcam"]),
         ("spots", "--sampling", "s", ["spiral", "square"]),

@@ -24,7 +24,7 @@ SHARE_OF_COSTLY = 450
 COSTLY = ("check_orientation", "choose_glasses", "fit_donuts", "shim")
 #: Packages of public functions, each a part of the long run.
 PACKAGES = ("core", "models", "raytrace", "wavefront", "design", "sky", "sensing", "measure", "reconstruction",
-            "pipeline", "imaging", "studies", "testing")  # fmt: skip
+            "pipeline", "imaging", "studies", "testing", "desk")  # fmt: skip
 #: Processor time of a call [s].
 SECONDS = 10.0
 #: Sizes of numbers, with both signs.
