@@ -14,7 +14,7 @@ from . import completion
 from .choices import names
 from .help_group import HelpGroup
 from .interrupt import interruptible
-from .options import FieldsDeg, Json, Model, Quiet, Threads, WavelengthsNm, field_list, name_list
+from .options import FieldsDeg, Json, Model, Quiet, Threads, WavelengthsNm, ccd_list, field_list, name_list, yaml_file
 from .tables import print_json
 
 app = typer.Typer()
@@ -43,24 +43,11 @@ def baseline_save(
     model: Model,
     out: Annotated[Path, Option("--out", "-o", help="Baseline to write, NAME.baseline.json.")],
     config: Annotated[
-        Path | None,
-        names(
-            completion.files(*completion.YAML),
-            metavar="RUN.yaml",
-            help="Run configuration, by its file: adds heights, PSFs, a PSF model.",
-        ),
+        Path | None, yaml_file("RUN.yaml", "Run configuration, by its file: adds heights, PSFs, a PSF model.")
     ] = None,
     field_deg: FieldsDeg = None,
     wavelength_nm: WavelengthsNm = None,
-    ccds: Annotated[
-        str | None,
-        names(
-            completion.ccds,
-            listed=True,
-            metavar="CCD,...",
-            help="CCDs for PSFs, with commas; the first is modelled.",
-        ),
-    ] = None,
+    ccds: Annotated[str | None, ccd_list("CCDs for PSFs, with commas; the first is modelled.")] = None,
     tolerance: Annotated[
         list[str] | None,
         names(
@@ -157,12 +144,7 @@ def check_command(
         names(completion.models, metavar="MODEL", help="Telescope in place of the baseline's own: bundled, or a path."),
     ] = None,
     config: Annotated[
-        Path | None,
-        names(
-            completion.files(*completion.YAML),
-            metavar="RUN.yaml",
-            help="Run configuration, by its file, in place of its own.",
-        ),
+        Path | None, yaml_file("RUN.yaml", "Run configuration, by its file, in place of its own.")
     ] = None,
     everything: Annotated[bool, Option("--all", help="Show all metrics, not the worst alone.")] = False,
     threads: Threads = None,

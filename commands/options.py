@@ -30,28 +30,22 @@ def set_option(kind: str) -> Any:
     )
 
 
+def yaml_file(metavar: str, help: str, **settings: Any) -> Any:
+    """Return an option, or argument by ``kind=Argument``, whose value is a YAML file; shells complete its name."""
+    return names(completion.files(*completion.YAML), metavar=metavar, help=help, **settings)
+
+
+def ccd_list(help: str) -> Any:
+    """Return an option whose value is names of CCDs with commas; shells complete each."""
+    return names(completion.ccds, listed=True, metavar="CCD,...", help=help)
+
+
 #: Words of options that several commands have.
 BANDS = ("u", "g", "r", "i", "z", "y")
 PROJECTIONS = ("zemax", "gnomonic", "postel")
-Config = Annotated[
-    Path | None,
-    names(
-        completion.files(*completion.YAML),
-        metavar="CONFIG.yaml",
-        help="Configuration; all has a default.",
-        kind=Argument,
-    ),
-]
+Config = Annotated[Path | None, yaml_file("CONFIG.yaml", "Configuration; all has a default.", kind=Argument)]
 Settings = Annotated[list[str] | None, set_option("run")]
-Ccds = Annotated[
-    str | None,
-    names(
-        completion.ccds,
-        listed=True,
-        metavar="CCD,...",
-        help="CCDs, separated by commas: R22_S11,R22_S12.",
-    ),
-]
+Ccds = Annotated[str | None, ccd_list("CCDs, separated by commas: R22_S11,R22_S12.")]
 Raft = Annotated[
     str | None, names(completion.rafts, listed=True, metavar="RAFT,...", help="All CCDs of rafts: R22 or R22,R23.")
 ]

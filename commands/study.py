@@ -10,11 +10,9 @@ from typer import Option
 
 from ..core.errors import ConfigError
 from ..core.terminal import print_line
-from . import completion
-from .choices import names
 from .inputs import configured_experiment
 from .interrupt import interruptible
-from .options import Config, Json, Quiet, Settings, TableFile, Threads, TruthStars, name_list, one_name_list
+from .options import Config, Json, Quiet, Settings, TableFile, Threads, TruthStars, ccd_list, name_list, one_name_list
 from .tables import Rows, print_json, wide_console, write_rows
 
 if TYPE_CHECKING:
@@ -42,15 +40,7 @@ _CAPTION = (
 @app.command("study")
 def study_command(
     config: Config = None,
-    ccds: Annotated[
-        str | None,
-        names(
-            completion.ccds,
-            listed=True,
-            metavar="CCD,...",
-            help="CCDs, separated by commas; by default nine across the field.",
-        ),
-    ] = None,
+    ccds: Annotated[str | None, ccd_list("CCDs, separated by commas; by default nine across the field.")] = None,
     stars: Annotated[str, Option(metavar="N,...", help="Stars of a CCD.")] = "10,20,40,80,160",
     orders: Annotated[str, Option(metavar="N,...", help="Orders of the polynomials.")] = "1,2,3,4,5,6",
     components: Annotated[str, Option(metavar="N,...", help="Components of the basis.")] = "5,10,20,40",

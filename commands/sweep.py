@@ -15,7 +15,7 @@ from ..core.threads import thread_count
 from . import completion
 from .choices import names
 from .default_group import DefaultGroup
-from .options import Json, Quiet, Threads, set_option
+from .options import Json, Quiet, Threads, set_option, yaml_file
 from .tables import plain_table, print_json, wide_console
 from .workers import DaskWorkers, Processes, Scheduler, long_work
 
@@ -54,10 +54,7 @@ def sweep_group() -> None:
 
 @sweep_app.command("run")
 def sweep_run(
-    sweep: Annotated[
-        Path | None,
-        names(completion.files(*completion.YAML), metavar="SWEEP.yaml", help="Sweep to run.", kind=Argument),
-    ] = None,
+    sweep: Annotated[Path | None, yaml_file("SWEEP.yaml", "Sweep to run.", kind=Argument)] = None,
     out: Annotated[Path | None, Option("--out", "-o", help="Store to write; SWEEP.sweep by default.")] = None,
     resume: Annotated[bool, Option("--resume", help="Compute only the points that are missing.")] = False,
     processes: Processes = None,

@@ -11,10 +11,9 @@ from typer import Argument, Option
 
 from ..core.file_names import file_name
 from ..core.terminal import print_line
-from . import completion
-from .choices import choice, names
+from .choices import choice
 from .inputs import errors_of, load_model
-from .options import GlassCatalogues, Json, Lenient, Model, Quiet, TableFile, Threads, set_option
+from .options import GlassCatalogues, Json, Lenient, Model, Quiet, TableFile, Threads, set_option, yaml_file
 from .tables import Rows, number_texts, print_json, write_rows
 from .workers import DaskWorkers, Processes, Scheduler, long_work
 
@@ -26,15 +25,7 @@ _SHOWN = 12
 @app.command("tolerance")
 def tolerance_command(
     model: Model,
-    tolerances: Annotated[
-        Path,
-        names(
-            completion.files(*completion.YAML),
-            metavar="TOL.yaml",
-            help="Tolerances, compensators, merit, requirement.",
-            kind=Argument,
-        ),
-    ],
+    tolerances: Annotated[Path, yaml_file("TOL.yaml", "Tolerances, compensators, merit, requirement.", kind=Argument)],
     out: Annotated[
         Path | None, Option("--out", "-o", help="Folder to write to; by default tolerance_ and the model.")
     ] = None,

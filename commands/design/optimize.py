@@ -17,7 +17,7 @@ from ...core.file_names import file_name
 from .. import completion
 from ..choices import choice, names
 from ..inputs import errors_of, warnings_shown
-from ..options import name_list, set_option
+from ..options import name_list, set_option, yaml_file
 from ..tables import Column
 from .command import Outcome, SharedOptions, design_command
 
@@ -177,12 +177,7 @@ def optimize(
         ),
     ] = None,
     config: Annotated[
-        Path | None,
-        names(
-            completion.files(*completion.YAML),
-            metavar="FILE.yaml",
-            help="In place of these: variables, operands, configurations, glasses.",
-        ),
+        Path | None, yaml_file("FILE.yaml", "In place of these: variables, operands, configurations, glasses.")
     ] = None,
     settings: Annotated[list[str] | None, set_option("optimization")] = None,
     out: Annotated[
