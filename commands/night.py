@@ -109,6 +109,8 @@ def listed_experiment(config: Configuration, visit: ListedVisit, folder: Path | 
 
 def show_night(result: NightResult, out: Path, table: Path | None, *, quiet: bool, as_json: bool) -> None:
     """Show what the visits of a list have given."""
+    from ..studies.night.report import REPORT_NAME
+
     if quiet:  # the reporter has printed nothing
         for visit, reason in result.left_out.items():
             print_line(f"pachon: visit {visit} is left out: {reason}", error=True)
@@ -125,7 +127,7 @@ def show_night(result: NightResult, out: Path, table: Path | None, *, quiet: boo
     if result.left_out:
         print_line(f"{len(result.left_out)} visits are left out, summary.json has the reasons")
     print_line(f"night: {out.resolve()}")
-    print_line(f"report: {(out / 'report.html').resolve()}")
+    print_line(f"report: {(out / REPORT_NAME).resolve()}")
 
 
 def _band_rows(result: NightResult) -> Rows:

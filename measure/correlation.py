@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.errors import DomainError, check_choice, shown
+from ..core.errors import DomainError, shown
 from ..core.plotting import BLUE, ORANGE, axes_at, label_log_axis, styled
 from ..core.result import Result
 from ..core.units import ARCMIN, angle, radians, real_array, require_count
@@ -150,9 +150,7 @@ class Correlation(Result):
     @check_arguments
     def within(self, separations: SeparationRange) -> np.ndarray:
         """Return the bins of a range of :data:`SEPARATION_RANGES`, the upper end excluded, [n_bins] bool."""
-        check_choice("separations", separations, SEPARATION_RANGES)
-        low, high = SEPARATION_RANGES[separations]
-        return (self.r_arcmin >= low) & (self.r_arcmin < high)
+        return in_range(self.r_arcmin, separations)
 
     @check_arguments
     def mean_xi_plus(self, separations: SeparationRange) -> float:
@@ -183,9 +181,19 @@ class Correlation(Result):
     def _mean_over_pairs(self, separations: SeparationRange, pairs: np.ndarray, xi: np.ndarray) -> np.ndarray:
         """Return the mean of xi [..., n_bins] over the pairs [..., n_bins] of a range."""
         inside = self.within(separations)
-        counts, values = pairs[..., inside], xi[..., inside]
-        with np.errstate(invalid="ignore"):
-            return np.asarray((np.where(counts > 0, values, 0.0) * counts).sum(axis=-1) / counts.sum(axis=-1))
+        return mean_over_pairs(pairs[..., inside], xi[..., inside])
+
+
+def in_range(r_arcmin: np.ndarray, separations: SeparationRange) -> np.ndarray:
+    """Return which separations [arcmin] are of a range of :data:`SEPARATION_RANGES`, the upper end excluded."""
+    low, high = SEPARATION_RANGES[separations]
+    return (r_arcmin >= low) & (r_arcmin < high)
+
+
+def mean_over_pairs(pairs: np.ndarray, xi: np.ndarray) -> np.ndarray:
+    """Return the mean of xi [..., n_bins] over the pairs [..., n_bins] of all bins; NaN where there are none."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray((np.where(pairs > 0, xi, 0.0) * pairs).sum(axis=-1) / pairs.sum(axis=-1))
 
 
 def draw_correlation_axes(axes: Axes) -> None:

@@ -20,6 +20,7 @@ _PREDICTED = ("e1", "e2", "size")
 #: Smallest separation of pairs [arcmin].
 SHORTEST_ARCMIN = 0.5
 _BINS_PER_DECADE = 6
+_FEWEST_BINS = 4
 
 
 def correlations(
@@ -79,9 +80,15 @@ def separation_bins(products: Sequence[CcdStars]) -> SeparationBins:
     everywhere = np.concatenate(
         [np.stack([s.field_x, s.field_y]) for p in products for s in (p.holdout, p.observed)], axis=1
     )
-    longest = float(np.hypot(*np.ptp(everywhere, axis=1)))
-    bins = max(4, round(_BINS_PER_DECADE * np.log10(longest / (SHORTEST_ARCMIN * ARCMIN))))
-    return SeparationBins(SHORTEST_ARCMIN * ARCMIN, longest, bins)
+    return bins_up_to(float(np.hypot(*np.ptp(everywhere, axis=1))))
+
+
+def bins_up_to(longest: float, exact: bool | None = None) -> SeparationBins:
+    """Return bins of separation from :data:`SHORTEST_ARCMIN` to the longest separation [rad], six a decade."""
+    shortest = SHORTEST_ARCMIN * ARCMIN
+    longest = max(longest, 2.0 * shortest)
+    bins = max(_FEWEST_BINS, round(_BINS_PER_DECADE * np.log10(longest / shortest)))
+    return SeparationBins(shortest, longest, bins, exact)
 
 
 def ccd_metrics(product: CcdProduct) -> dict[str, Any]:

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from ...core.plotting import BLUE, RED, new_figure, png_bytes, styled
+from ...core.plotting import new_figure, png_bytes, styled
 from ...measure.correlation_plots import draw_correlation, log_axes
+from ...measure.focal_plane_axes import AWAY, TRUTH
 from .maps import NightMaps
 from .residual_correlation import MeanCorrelation
 
-_LABELS = {"truth": (BLUE, "o", "noise-free PSFs"), "away": (RED, "D", "less the models, where no star is")}
+_LABELS = {"truth": (TRUTH, "o", "noise-free PSFs"), "away": (AWAY, "^", "less the models, where no star is")}
 _TITLES = ("rms width of the PSF [pixel]", "limiting magnitude (AB, S/N 5)", "visits")
 _COLOURS = ("viridis", "cividis", "magma")
 #: Place of the number of visits among the titles, which begins at zero.
@@ -30,11 +31,10 @@ def maps_plot(maps: NightMaps) -> bytes:
     bands = sorted(maps.bands)
     with styled():
         figure = new_figure(12.5, 3.9 * len(bands))
-        grids = [_Grid(maps.pictured(band)[0]) for band in bands]
-        for row, (band, grid) in enumerate(zip(bands, grids, strict=True)):
-            for column, (content, title, colours) in enumerate(
-                zip(maps.pictured(band), _TITLES, _COLOURS, strict=True)
-            ):
+        for row, band in enumerate(bands):
+            pictured = maps.pictured(band)
+            grid = _Grid(pictured[0])
+            for column, (content, title, colours) in enumerate(zip(pictured, _TITLES, _COLOURS, strict=True)):
                 axes = figure.add_subplot(len(bands), 3, 3 * row + column + 1, projection=grid.projection)
                 values = grid.values(content)
                 least = 0.0 if column == _COUNTED else None

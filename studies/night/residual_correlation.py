@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.products import Columns
-from ...core.units import ARCMIN
-from ...measure.correlation import SEPARATION_RANGES, SeparationBins, shear_correlation
+from ...measure.correlation import SEPARATION_RANGES, SeparationBins, in_range, mean_over_pairs, shear_correlation
 from ...pipeline.experiment import Experiment
 from ...pipeline.photometry import pixel_angle
 from ...pipeline.resolved_values import resolved_value
+from ...pipeline.summary import bins_up_to
 
 #: Ellipticities that are correlated: of the noise-free PSFs, and of these less the models' where no star is.
 KINDS = ("truth", "away")
@@ -28,9 +28,6 @@ COLUMNS = {
     "XI_TRUTH": ("", "xi+ of g of the noise-free PSFs"),
     "XI_AWAY": ("", "xi+ of g of the noise-free PSFs less that of the models where no star is"),
 }
-_SHORTEST = 0.5 * ARCMIN
-_BINS_PER_DECADE = 6
-_FEWEST_BINS = 4
 #: Places up to which pairs are counted one by one: a third of a second.
 _EXACT_LIMIT = 3000
 
@@ -105,14 +102,14 @@ def range_means(visits: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float]:
     """
     metrics: dict[str, float] = {}
     for kind in KINDS if visits else ():
-        for name, (low, high) in SEPARATION_RANGES.items():
+        for name in SEPARATION_RANGES:
             sums = []
             for visit in visits:
                 xi = visit[f"XI_{kind.upper()}"]
-                within = (visit["R"] >= low) & (visit["R"] < high) & np.isfinite(xi)
+                within = in_range(visit["R"], name) & np.isfinite(xi)
                 pairs = visit["PAIRS"][within]
-                if pairs.sum() > 0:
-                    sums.append((float(pairs.sum()), float((pairs * xi[within]).sum() / pairs.sum())))
+                if pairs.any():
+                    sums.append((float(pairs.sum()), float(mean_over_pairs(pairs, xi[within]))))
             if sums:
                 pairs_of_visits, values = np.array(sums).T
                 key = f"xi_plus_g_{kind}_{name}"
@@ -168,6 +165,4 @@ def _separation_bins(experiment: Experiment, exact: bool) -> SeparationBins:
     camera = experiment.camera
     numbers = np.array([camera.ccd_index(name) for name in resolved_value(experiment.config.ccds)])
     extent = float(np.hypot(*np.ptp(camera.corners(numbers).reshape(-1, 2), axis=0)))
-    longest = max(extent * _angle_per_length(experiment), 2.0 * _SHORTEST)
-    bins = round(_BINS_PER_DECADE * np.log10(longest / _SHORTEST))
-    return SeparationBins(_SHORTEST, longest, max(_FEWEST_BINS, bins), exact)
+    return bins_up_to(extent * _angle_per_length(experiment), exact)
