@@ -31,7 +31,7 @@ class Picture:
 def render(folder: Path, template: str, **content: Any) -> str:
     """Return a page made from a template of a folder; a missing name is an error.
 
-    Templates include the common styles of this layer, ``style.css`` and ``print.css``.
+    Templates include the common styles of this layer, ``style.css`` and ``print.css``, and import ``pictures.html``.
     """
     environment = Environment(
         loader=FileSystemLoader([folder, Path(__file__).parent / "templates"]),
