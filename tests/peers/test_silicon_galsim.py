@@ -41,7 +41,7 @@ def test_size_and_ellipticity_are_those_of_galsims_sensor(band, wavelength):
     count, rng = 500_000, np.random.default_rng(3)
     telescope = pachon.load_telescope(f"lsst_v3.3_{band}").perturbed("Detector", shift=(0.0, 0.0, 8e-6))
     field = np.deg2rad([1.1, 0.7])
-    sensor = galsim.SiliconSensor(rng=galsim.BaseDeviate(5), nrecalc=0)
+    sensor = galsim.SiliconSensor(rng=galsim.BaseDeviate(5), nrecalc=1e300)
     diffusion = sensor._calculate_diff_step() * 1e-6
     # The temperature of GalSim's table.
     silicon = Silicon(sensor.config["SensorThickness"] * 1e-6, temperature=295.0)

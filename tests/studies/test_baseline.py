@@ -437,7 +437,7 @@ def test_what_is_no_json_is_one_line(tmp_path, capsys, text, words):
         (["check", "."], "cannot be read"),
         (["check", "--model", "lsst_v3.3_i"], "expected a FILE"),
         (["baseline", "save", "lsst_v3.3_r"], "'--out'"),
-        (["baseline", "sav", "lsst_v3.3_r"], "Did you mean 'save'?"),
+        (["baseline", "sav", "lsst_v3.3_r"], "'save'"),
         (["baseline", "save", "lsst_v3.3_x", "-o", "x.json"], "lsst_v3.3_x"),
         (["baseline", "save", "lsst_v3.3_r", "-o", "x.json", "--ccds", "R22_S11"], "expected a configuration"),
         (["baseline", "save", "lsst_v3.3_r", "-o", "x.json", "--config", "none.yaml"], "none.yaml"),

@@ -224,7 +224,7 @@ def test_no_stars_and_no_light(lsst_r):
 def test_configurations_offer_every_engine():
     for engine in ENGINES:
         assert Configuration.model_validate({"psf": {"engine": engine}}).psf.engine == engine
-    with pytest.raises(ValidationError, match=" ".join(["Input should be", *map(repr, ENGINES)]).replace(" ", ".*")):
+    with pytest.raises(ValidationError, match=".*".join(map(repr, ENGINES))):
         Configuration.model_validate({"psf": {"engine": "exact"}})
 
 
