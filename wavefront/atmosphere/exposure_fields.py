@@ -20,10 +20,10 @@ from ...core.launch import launch
 from ...core.random_streams import stream
 from ...core.warp_arrays import warp_array
 from ...models.zernike_polynomials import noll_to_nm
-from .field_kernels import add_wavefronts, pairs, spread_over_grid
+from .field_kernels import add_wavefronts, pairs, read_splines, spread_over_grid, zernikes
 from .mean_wavefront import mean_wavefront_covariance, radial_transform
 from .moment_covariance import PAIRS, ExposedAir, MomentResponse, as_matrices, moment_covariance
-from .spline import spline_weights, stencil_gain
+from .spline import stencil_gain
 from .turbulence import path_spectrum
 
 #: Noll indices of the mean wavefront: smaller terms move shapes by less than 1e-4.
@@ -70,16 +70,15 @@ class SplineFields:
 
     def at(self, slopes: np.ndarray) -> np.ndarray:
         """Return the values at field slopes [n, 2] [rad], [n, n_field]; each place by itself."""
-        size = self.coefficients.shape[1]
-        place = slopes.T * (size / self.side)
-        knot = np.floor(place).astype(np.int64)
-        weight_x, weight_y = spline_weights(place - knot)
-        values = np.zeros((len(self.coefficients), len(slopes)))
-        for j in range(4):
-            for i in range(4):
-                row, column = (knot[1] + j - 1) % size, (knot[0] + i - 1) % size
-                values += weight_y[:, j] * weight_x[:, i] * self.coefficients[:, row, column]
-        return values.T
+        values = np.zeros((len(slopes), len(self.coefficients)))
+        place = slopes * (self.coefficients.shape[1] / self.side)
+        launch(
+            read_splines,
+            len(slopes),
+            [warp_array(place), warp_array(self.coefficients, wp.float32), warp_array(values)],
+            threads=1,
+        )
+        return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +240,7 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
     weights = np.array([air.weights[n] for n in layers])
     drift = air.exposure * np.array([air.velocities[n] for n in layers])
     radial = np.array([radial_transform(j, _HIGHEST, _TABLE, air.obscuration) for j in NOLL])
-    spectrum = np.empty((len(radial), size, size // 2 + 1), dtype=np.complex64)
+    spectrum = np.empty((len(NOLL), size, size // 2 + 1), dtype=np.complex64)
     launch(
         add_wavefronts,
         size,
@@ -252,7 +251,7 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
             warp_array(scale * size * np.sqrt(weights) / (distance * side), wp.float32),
             1.0 / air.outer_scale,
             1.0 / side,
-            warp_array(radial, wp.float32),
+            warp_array(radial.T, zernikes),
             air.diameter * (_TABLE - 1) / _HIGHEST,
             warp_array([noll_to_nm(j)[1] for j in NOLL], wp.int32),
             warp_array(spectrum, wp.vec2f),

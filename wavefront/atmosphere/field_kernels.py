@@ -10,6 +10,9 @@ wp.set_module_options(FORWARD_OPTIONS)
 
 #: Covariances of the components of the moments.
 pairs = wp.types.vector(6, wp.float32)
+#: Zernikes of the mean wavefront.
+TERMS = 8
+zernikes = wp.types.vector(TERMS, wp.float32)
 
 
 @wp.func
@@ -64,6 +67,18 @@ def spread_over_grid(
             grid[pair, (size - row) % size, (size - column) % size] = value[pair]
 
 
+@wp.func
+def multiple_angle(direction: wp.vec2f, m: wp.int32):
+    """Cosine and sine of a whole multiple of the angle of a unit vector."""
+    cosine = wp.float32(1.0)
+    sine = wp.float32(0.0)
+    for _ in range(m):
+        turned = cosine * direction[0] - sine * direction[1]
+        sine = cosine * direction[1] + sine * direction[0]
+        cosine = turned
+    return cosine, sine
+
+
 @wp.kernel
 def add_wavefronts(
     first: wp.int32,
@@ -73,7 +88,7 @@ def add_wavefronts(
     strength: wp.array(dtype=wp.float32),
     outer_frequency: wp.float32,
     frequency_step: wp.float32,
-    radial: wp.array2d(dtype=wp.float32),
+    radial: wp.array(dtype=zernikes),
     per_frequency: wp.float32,
     order: wp.array(dtype=wp.int32),
     spectrum: wp.array3d(dtype=wp.vec2f),
@@ -82,48 +97,94 @@ def add_wavefronts(
 
     Arguments: noise [layer, row, column]: transform of white noise; distance [layer] along the line of sight [m];
     drift [layer, 2] in the exposure [m]; strength [layer]: amplitude of a mode but for the power of its frequency;
-    outer_frequency: one over the outer scale [1/m]; frequency_step of the field [cycles/rad]; radial [term, k]: mean
+    outer_frequency: one over the outer scale [1/m]; frequency_step of the field [cycles/rad]; radial [k]: mean
     over the pupil of a term's radial part times a wave, against the frequency, whose table has per_frequency steps a
     cycle/m; order [term] m of the Zernikes, negative for sines; spectrum [term, row, column].
     """
     row = first + wp.tid()
     size = spectrum.shape[1]
-    last = wp.float32(radial.shape[1] - 2)
+    last = wp.float32(radial.shape[0] - 2)
     signed = wp.where(row > size / 2, row - size, row)
     for column in range(spectrum.shape[2]):
-        for term in range(order.shape[0]):
-            spectrum[term, row, column] = wp.vec2f(wp.float32(0.0), wp.float32(0.0))
+        re = zernikes()
+        im = zernikes()
+        around = zernikes()
         if (row > 0 or column > 0) and 2 * column < size and 2 * row != size:
             across = frequency_step * wp.float32(column)
             up = frequency_step * wp.float32(signed)
-            angle = wp.atan2(up, across)
+            length = wp.sqrt(across * across + up * up)
+            direction = wp.vec2f(across / length, up / length)
+            for term in range(TERMS):
+                cosine, sine = multiple_angle(direction, wp.abs(order[term]))
+                around[term] = wp.where(order[term] < 0, sine, cosine)
             for layer in range(distance.shape[0]):
-                nu_x = across / distance[layer]
-                nu_y = up / distance[layer]
-                squared = nu_x * nu_x + nu_y * nu_y
-                turns = wp.float32(wp.PI) * (nu_x * drift[layer, 0] + nu_y * drift[layer, 1])
-                smear = wp.float32(1.0)
-                if wp.abs(turns) > wp.float32(1e-3):
-                    smear = wp.sin(turns) / turns
-                power = wp.pow(squared + outer_frequency * outer_frequency, wp.float32(-11.0 / 12.0))
-                mode = strength[layer] * power * smear * noise[layer, row, column]
-                at = wp.sqrt(squared) * per_frequency
+                at = length / distance[layer] * per_frequency
                 if at < last:
+                    nu_x = across / distance[layer]
+                    nu_y = up / distance[layer]
+                    squared = nu_x * nu_x + nu_y * nu_y
+                    turns = wp.float32(wp.PI) * (nu_x * drift[layer, 0] + nu_y * drift[layer, 1])
+                    smear = wp.float32(1.0)
+                    if wp.abs(turns) > wp.float32(1e-3):
+                        smear = wp.sin(turns) / turns
+                    power = wp.pow(squared + outer_frequency * outer_frequency, wp.float32(-11.0 / 12.0))
+                    mode = strength[layer] * power * smear * noise[layer, row, column]
                     knot = wp.int32(at)
-                    part = at - wp.float32(knot)
-                    for term in range(order.shape[0]):
-                        m = wp.abs(order[term])
-                        around = wp.cos(wp.float32(m) * angle)
-                        if order[term] < 0:
-                            around = wp.sin(wp.float32(m) * angle)
-                        gain = around * (radial[term, knot] + part * (radial[term, knot + 1] - radial[term, knot]))
-                        value = gain * mode
-                        # A layer's place runs against the field: the conjugate of i^m.
-                        turn = m % 4
-                        if turn == 1:
-                            value = wp.vec2f(value[1], -value[0])
-                        elif turn == 2:
-                            value = -value
-                        elif turn == 3:
-                            value = wp.vec2f(-value[1], value[0])
-                        spectrum[term, row, column] = spectrum[term, row, column] + value
+                    gain = wp.cw_mul(around, radial[knot] + (at - wp.float32(knot)) * (radial[knot + 1] - radial[knot]))
+                    re = re + mode[0] * gain
+                    im = im + mode[1] * gain
+        for term in range(TERMS):
+            value = wp.vec2f(re[term], im[term])
+            # A layer's place runs against the field: the conjugate of i^m.
+            turn = wp.abs(order[term]) % 4
+            if turn == 1:
+                value = wp.vec2f(value[1], -value[0])
+            elif turn == 2:
+                value = -value
+            elif turn == 3:
+                value = wp.vec2f(-value[1], value[0])
+            spectrum[term, row, column] = value
+
+
+@wp.func
+def spline_weight(number: wp.int32, part: wp.float64):
+    """Weight of one of the four coefficients around a place between the second and the third, of a cubic B-spline."""
+    one = wp.float64(1.0)
+    three = wp.float64(3.0)
+    four = wp.float64(4.0)
+    six = wp.float64(6.0)
+    rest = one - part
+    weight = rest * rest * rest
+    if number == 1:
+        weight = four + part * part * (three * part - six)
+    elif number == 2:
+        weight = four + rest * rest * (three * rest - six)
+    elif number == 3:
+        weight = part * part * part
+    return weight / six
+
+
+@wp.kernel
+def read_splines(
+    first: wp.int32,
+    place: wp.array2d(dtype=wp.float64),
+    coefficients: wp.array3d(dtype=wp.float32),
+    values: wp.array2d(dtype=wp.float64),
+):
+    """Read periodic fields of cubic B-splines at one place.
+
+    Arguments: place [place, 2]: x and y in samples; coefficients [field, row, column]; values [place, field].
+    """
+    item = first + wp.tid()
+    size = coefficients.shape[1]
+    knot_x = wp.int32(wp.floor(place[item, 0]))
+    knot_y = wp.int32(wp.floor(place[item, 1]))
+    part_x = place[item, 0] - wp.float64(knot_x)
+    part_y = place[item, 1] - wp.float64(knot_y)
+    for j in range(4):
+        row = (((knot_y + j - 1) % size) + size) % size
+        for i in range(4):
+            column = (((knot_x + i - 1) % size) + size) % size
+            weight = spline_weight(j, part_y) * spline_weight(i, part_x)
+            for field in range(coefficients.shape[0]):
+                values[item, field] = values[item, field] + weight * wp.float64(coefficients[field, row, column])

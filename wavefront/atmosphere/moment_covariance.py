@@ -43,7 +43,7 @@ LEAST_EXPOSURE = 5.0
 # much closer.
 _SPACING = 1.4
 # The same at delays near zero [m].
-_NEAR_SPACING = 0.5
+_NEAR_SPACING = 1.0
 # Largest drift of a layer from one delay to the next [m].
 _DRIFT = 1.4
 # The same near zero [m].
