@@ -31,6 +31,7 @@ def page_names(session: PageSession, *, live: bool) -> dict[str, Any]:
         "title": session.title,
         "subtitle": session.subtitle,
         "picture_names": names,
+        "hidden_names": [str(picture.figure.name) for picture in session.pictures if not picture.figure.visible],
         "wide_names": ["stamps"],
         "root_names": ["sidebar"] if live else [],
         "state_text": "" if live else session.state_words,

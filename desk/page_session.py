@@ -11,6 +11,9 @@ from bokeh.models import Column, CustomJS
 from .pictures import Picture
 from .widgets import FIRST_THEME, colour, status_line, theme_toggle
 
+#: Shows or hides the frame of a picture with it.
+_CARD = "document.querySelector(`[data-picture='${name}']`).hidden = !figure.visible;"
+
 
 class PageSession(ABC):
     """A page in a browser: its widgets, and pictures in the order of the page."""
@@ -38,6 +41,9 @@ class PageSession(ABC):
     def add_to(self, document: Document) -> None:
         """Add the roots to the document of a page."""
         colour(self.sidebar)
+        for picture in self.pictures:
+            card = CustomJS(args={"name": picture.figure.name, "figure": picture.figure}, code=_CARD)
+            picture.figure.js_on_change("visible", card)
         for root in (self.sidebar, self.status, self.table, *(picture.figure for picture in self.pictures)):
             document.add_root(root)
         document.js_on_event(DocumentReady, CustomJS(args={"toggle": self.theme_toggle}, code=FIRST_THEME))

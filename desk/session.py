@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import binascii
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from time import monotonic
 from typing import Any
 
@@ -13,7 +13,9 @@ from bokeh.document import Document
 from bokeh.layouts import column, row
 from bokeh.models import (
     Button,
+    CheckboxGroup,
     CustomJS,
+    Div,
     FileInput,
     Select,
     Slider,
@@ -24,6 +26,7 @@ from bokeh.models import (
 from ..core.errors import PachonError
 from .bench import Bench, Control
 from .page_session import PageSession
+from .panels import BesidePanel, MtfPanel, OptimizePanel, Panel, SensitivityPanel, SpacePanel
 from .pictures import (
     BACKGROUNDS,
     EnergyPicture,
@@ -45,6 +48,7 @@ from .views import (
     WhiskersView,
     heights_view,
     images_view,
+    layout_of,
     numbers,
     opd_view,
     section_view,
@@ -106,12 +110,23 @@ class Session(PageSession):
             tile /= np.sqrt(len(places) / len(camera))
         self.spots = SpotsPicture(np.rad2deg(self.bench.spot_fields), self._choose_field)
         self.opd, self.zernikes, self.energy = OpdPicture(), ZernikePicture(), EnergyPicture()
+
+        def new_whiskers(name: str, of: str) -> WhiskersPicture:
+            return WhiskersPicture(extent, tile, heights=camera is not None, name=name, of=of)
+
         self.optics = ImagePicture("optics", "Rays of the star, optics alone")
         self.seen = ImagePicture("seen", "Image of the star, with the atmosphere")
-        self.whiskers = WhiskersPicture(extent, tile, heights=camera is not None)
+        self.whiskers = new_whiskers("whiskers", "")
         self.section = SectionPicture()
-        first = (self.spots, self.whiskers, self.opd, self.zernikes)
-        self.pictures = (*first, self.optics, self.energy, self.section, self.seen)
+        self.beside = BesidePanel(self.bench, new_whiskers)
+        self.optimization = OptimizePanel(self.bench, lambda: self.scene, self.change, self._defer, self._say)
+        sensitivity = SensitivityPanel(lambda: self._draw_panel(sensitivity))
+        self.panels: tuple[Panel, ...] = (self.beside, MtfPanel(), sensitivity, self.optimization, SpacePanel())
+        now = (self.spots, self.whiskers, self.opd)
+        # Each picture of the pinned state stands beside that of the state.
+        pairs = [picture for pair in zip(now, self.beside.pictures, strict=True) for picture in pair]
+        others = [picture for panel in self.panels[1:] for picture in panel.pictures]
+        self.pictures = (*pairs, self.zernikes, self.optics, self.energy, self.section, *others, self.seen)
 
     def _choose_field(self, index: int) -> None:
         x, y = np.rad2deg(self.bench.spot_fields[index])
@@ -149,7 +164,13 @@ class Session(PageSession):
             buttons.append(row(hide, _button("Reveal", self.reveal)))
         saved = _download("Save state", self.state_text, "desk.yaml")
         save = row(saved, _download("As Python", self.python, "desk.py"))
-        parts = [self.group, self.sliders, *buttons, self.background, self.density, save, load]
+        self.more = CheckboxGroup(labels=[panel.label for panel in self.panels], active=[])
+        self.more.on_change("active", lambda attribute, old, new: self.show_panels(new))
+        wanted = [widget for panel in self.panels for widget in panel.widgets]
+        for panel in self.panels:
+            panel.set_shown(False)
+        more = [Div(text="More pictures"), self.more, *wanted]
+        parts = [self.group, self.sliders, *buttons, *more, self.background, self.density, save, load]
         self.sidebar = column(*parts, self.state_text, self.python, name="sidebar", sizing_mode="stretch_width")
 
     def _show_group(self, group: str) -> None:
@@ -294,10 +315,34 @@ class Session(PageSession):
         else:
             self.change(state)
 
+    def show_panels(self, active: Sequence[int]) -> None:
+        """Show the pictures of some panels, and hide those of the others."""
+        for number, panel in enumerate(self.panels):
+            panel.set_shown(number in active)
+        if self.beside.shown and not self.compared:
+            self.pin()
+        self.schedule()
+
+    def _draw_panel(self, panel: Panel) -> None:
+        if panel.shown:
+            try:
+                panel.draw(self.scene, self.views, self.compared)
+            except PachonError as error:
+                self._say(error)
+
+    def _defer(self, action: Callable[[], None]) -> None:
+        """Run an action when the page has drawn what it waits for; at once where there is no page."""
+        if self.document is None or self.document.session_context is None:
+            action()
+        else:
+            self.document.add_timeout_callback(action, _PAUSE)
+
     def _set_background(self, name: str) -> None:
-        self.whiskers.background = name
-        self.whiskers.paint(self.theme)
+        for picture in (self.whiskers, self.beside.whiskers):
+            picture.background = name
+            picture.paint(self.theme)
         self._show_whiskers()
+        self._draw_panel(self.beside)
 
     @property
     def state_words(self) -> str:
@@ -350,9 +395,9 @@ class Session(PageSession):
             self._changed_heights = False
         self._update(WhiskersView, lambda: whiskers_view(scene))
         if SpotsView in self.views:
-            self.spots.show(self.views[SpotsView], scene.state.field_deg)
+            self.spots.show(self.views[SpotsView], scene.state.field_deg, self._beside(SpotsView))
         if OpdView in self.views:
-            self.opd.show(self.views[OpdView])
+            self.opd.show(self.views[OpdView], self._beside(OpdView))
             self.zernikes.show(self.views[OpdView], self.compared.get(OpdView))
         self._show_whiskers()
         self._show_numbers()
@@ -371,13 +416,15 @@ class Session(PageSession):
             self.energy.show(view, self.compared.get(ImagesView))
         if self._changed_geometry:
             try:
-                self.section.show(section_view(scene))
+                self.section.show(section_view(scene, layout_of(scene)))
             except PachonError as error:
                 self._say(error)
             self._changed_geometry = False
         if self.density.value != "1":
             self._update(WhiskersView, lambda: whiskers_view(scene, int(self.density.value)))
             self._show_whiskers()
+        for panel in self.panels:
+            self._draw_panel(panel)
         self._show_numbers()
         self.state_text.value = self.history.state.to_yaml()
         self.python.value = python_text(self.bench, self.history.state)
@@ -392,7 +439,12 @@ class Session(PageSession):
     def _show_whiskers(self) -> None:
         if WhiskersView in self.views:
             view, compared = self.views[WhiskersView], self.compared.get(WhiskersView)
-            self.whiskers.show(view, self.views.get(HeightsView), compared)
+            over = None if self.beside.shown else compared
+            self.whiskers.show(view, self.views.get(HeightsView), over, self._beside(WhiskersView))
+
+    def _beside(self, kind: type) -> Any:
+        """Return the view of the pinned state that stands beside that of the state, None where none does."""
+        return self.compared.get(kind) if self.beside.shown else None
 
     def _show_numbers(self) -> None:
         now, then = (numbers(*(v.get(k) for k in _NUMBERED)) for v in (self.views, self.compared))

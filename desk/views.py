@@ -31,7 +31,7 @@ from .state import DeskState
 RINGS = 6
 #: Cells across the pupil of the OPD map, and the highest Zernike term.
 _GRID = 64
-_JMAX = 22
+JMAX = 22
 #: Points along a side of the map of heights.
 _HEIGHTS = 100
 #: Pixels along a side of PSFs; radii of encircled energy.
@@ -122,12 +122,12 @@ def opd_view(scene: Scene) -> OpdView:
     opd = wavefront_opd(scene.telescope, scene.field, scene.wavelength, grid=_GRID, focal_plane=plane)
     flat = opd.without_tilt * 1e9
     request = Request.of(scene.telescope, scene.field[None], scene.wavelength).on(plane)
-    zernikes = wavefront_zernikes(request, jmax=_JMAX).coefficients[0] * 1e9
+    zernikes = wavefront_zernikes(request, jmax=JMAX).coefficients[0] * 1e9
     lit = np.isfinite(flat)
     rms = float(np.sqrt(np.mean(flat[lit] ** 2))) if lit.any() else math.nan
     step = float(opd.x[0, 1] - opd.x[0, 0]) if opd.x.shape[1] > 1 else 0.0
     half = float(np.abs(opd.x).max()) + 0.5 * abs(step)
-    return OpdView(flat, half, np.arange(4, _JMAX + 1), zernikes[3:], rms)
+    return OpdView(flat, half, np.arange(4, JMAX + 1), zernikes[3:], rms)
 
 
 @dataclass(frozen=True)
@@ -295,10 +295,14 @@ class SectionView:
     ray_fields: np.ndarray  #: index of the field of each ray
 
 
-def section_view(scene: Scene) -> SectionView:
-    """Return the surfaces, lenses and rays in section."""
+def layout_of(scene: Scene) -> Layout:
+    """Return the layout, with rays of the axis and of a field near the edge."""
     edge = scene.bench.nominal.field_radius
-    drawing: Layout = layout(scene.telescope, [(0.0, 0.0), (0.0, 0.9 * edge)], scene.wavelength)
+    return layout(scene.telescope, [(0.0, 0.0), (0.0, 0.9 * edge)], scene.wavelength)
+
+
+def section_view(scene: Scene, drawing: Layout) -> SectionView:
+    """Return the surfaces, lenses and rays in section."""
     pieces = []
     for lens in drawing.lenses:
         front, back = (_finite(drawing.profiles[name]) for name in (lens.front, lens.back))

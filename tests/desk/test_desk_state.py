@@ -14,7 +14,7 @@ from pachon.core.errors import ConfigError, DomainError, PachonError, UnknownNam
 from pachon.desk.bench import Bench
 from pachon.desk.python_text import python_text
 from pachon.desk.state import DeskState, History, is_state_file
-from pachon.desk.views import Scene, WhiskersView, numbers, opd_view, section_view, spots_view, whiskers_view
+from pachon.desk.views import Scene, WhiskersView, layout_of, numbers, opd_view, section_view, spots_view, whiskers_view
 from pachon.models import OpticsState
 from pachon.wavefront.psf.stamps import Stamps
 
@@ -148,7 +148,8 @@ def test_whiskers_have_the_angle_and_length_of_the_ellipticity():
 
 
 def test_the_section_names_every_surface_with_its_radius():
-    pieces = {piece.name: piece for piece in section_view(Scene.of(BENCH, BENCH.start)).pieces}
+    scene = Scene.of(BENCH, BENCH.start)
+    pieces = {piece.name: piece for piece in section_view(scene, layout_of(scene)).pieces}
     assert set(BENCH.nominal.surface_names) <= set(pieces)
     assert pieces["M1"].text == f"radius {BENCH.nominal.surface('M1').shape.parameters['radius']:.6g} m, mirror"
     assert pieces["L1"].glass
