@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from bokeh.models import ColumnDataSource, CrosshairTool, FixedTicker, HoverTool, Span
@@ -112,7 +113,10 @@ class SpacePicture(Picture):
         for source, rays in ((self._rays, True), (self._surfaces, False)):
             kept = [line for line in lines if (line.kind == "ray") == rays]
             ends = [projected(line.points, *angles) for line in kept]
-            data = {"xs": [np.float32(p[:, 0]) for p in ends], "ys": [np.float32(p[:, 1]) for p in ends]}
+            data: dict[str, list[Any]] = {
+                "xs": [np.float32(p[:, 0]) for p in ends],
+                "ys": [np.float32(p[:, 1]) for p in ends],
+            }
             if not rays:
                 colors = {"refract": BLUE, "detector": GREEN, "pass": GREY}
                 data |= {"name": [line.name for line in kept], "kind": [line.kind for line in kept]}
