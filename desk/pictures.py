@@ -127,8 +127,8 @@ class SectionPicture(Picture):
 class SpotsPicture(Picture):
     """Spots over the field, magnified; a click chooses the field of the star."""
 
-    def __init__(self, field_deg: np.ndarray, choose: Callable[[int], None]) -> None:
-        super().__init__("spots", "Spots over the field", "field x [deg]", "field y [deg]")
+    def __init__(self, field_deg: np.ndarray, choose: Callable[[int], None], name: str = "spots", of: str = "") -> None:
+        super().__init__(name, f"{of}Spots over the field", "field x [deg]", "field y [deg]")
         self._fields = field_deg
         distance = np.linalg.norm(field_deg[:, None] - field_deg, axis=-1)
         spacing = float(np.median(np.where(distance > 0, distance, np.inf).min(axis=1))) if len(field_deg) > 1 else 1.0
@@ -155,11 +155,11 @@ class SpotsPicture(Picture):
 
         self._marks.selected.on_change("indices", chosen)
 
-    def show(self, view: SpotsView, star_deg: tuple[float, float]) -> None:
-        """Draw spots, and a frame about the star."""
+    def show(self, view: SpotsView, star_deg: tuple[float, float], beside: SpotsView | None = None) -> None:
+        """Draw spots, and a frame about the star; spots that stand beside them have the same scale."""
         away = np.hypot(view.x, view.y)
-        reach = max(float(np.quantile(away, 0.98)) if len(away) else 1.0, 1e-3)
-        bar = _round_up(reach)
+        distances = [away, *([] if beside is None else [np.hypot(beside.x, beside.y)])]
+        bar = _round_up(max([1e-3, *(float(np.quantile(d, 0.98)) for d in distances if len(d))]))
         scale = 0.45 * self._spacing / bar
         field = view.field_deg[view.index]
         near = away < 2.2 * bar
@@ -199,15 +199,16 @@ class MapPicture(Picture):
 class OpdPicture(MapPicture):
     """The OPD over the entrance pupil."""
 
-    def __init__(self) -> None:
-        super().__init__("opd", "OPD at the star", ("pupil x [m]", "pupil y [m]"), "nm", _DIVERGING)
+    def __init__(self, name: str = "opd", of: str = "") -> None:
+        self._title = f"{of}OPD at the star"
+        super().__init__(name, self._title, ("pupil x [m]", "pupil y [m]"), "nm", _DIVERGING)
 
-    def show(self, view: OpdView) -> None:
-        """Draw a map; blue is the sign of a longer path."""
-        lit = view.opd_nm[np.isfinite(view.opd_nm)]
-        bound = float(np.quantile(np.abs(lit), 0.99)) if len(lit) else 1.0
+    def show(self, view: OpdView, beside: OpdView | None = None) -> None:
+        """Draw a map; blue is the sign of a longer path. One that stands beside it has the same scale."""
+        maps = [v.opd_nm[np.isfinite(v.opd_nm)] for v in (view, beside) if v is not None]
+        bound = max((float(np.quantile(np.abs(lit), 0.99)) for lit in maps if len(lit)), default=1.0)
         self.show_map(view.opd_nm, view.half_m, -bound, bound)
-        self.figure.title.text = f"OPD at the star, rms {view.rms_nm:.4g} nm"
+        self.figure.title.text = f"{self._title}, rms {view.rms_nm:.4g} nm"
 
 
 class ZernikePicture(Picture):
@@ -286,10 +287,19 @@ class WhiskersPicture(Picture):
     """Whiskers over the focal plane, on a map of heights, FWHM or ellipticity."""
 
     def __init__(
-        self, extent_mm: float, tile_mm: float, *, heights: bool, center_mm: tuple[float, float] = (0.0, 0.0)
+        self,
+        extent_mm: float,
+        tile_mm: float,
+        *,
+        heights: bool,
+        center_mm: tuple[float, float] = (0.0, 0.0),
+        name: str = "whiskers",
+        of: str = "",
     ) -> None:
-        super().__init__("whiskers", "Whiskers", "detector x [mm]", "detector y [mm]")
-        self._extent, self._center = extent_mm, center_mm
+        super().__init__(name, "Whiskers", "detector x [mm]", "detector y [mm]")
+        self._extent, self._center, self._of = extent_mm, center_mm, of
+        self._palette: Any = _DIVERGING
+        self._heights: HeightsView | None = None
         # Whiskers of many stars on one CCD lie beside their tiles too.
         self._on_tiles = tile_mm > 0.05 * extent_mm
         self.background = BACKGROUNDS[0] if heights else BACKGROUNDS[1]
@@ -312,9 +322,16 @@ class WhiskersPicture(Picture):
         tips = [("x, y [mm]", "@x{0.0}, @y{0.0}"), ("e", "@e{0.00} %"), ("FWHM", "@fwhm{0.000} arcsec")]
         self.figure.add_tools(HoverTool(renderers=[self._rects], tooltips=tips))
 
-    def show(self, view: WhiskersView, heights: HeightsView | None, compared: WhiskersView | None) -> None:
-        """Draw whiskers, those of the state that is compared to below them."""
-        drawn = [shapes.e for shapes in (view, compared) if shapes is not None and np.isfinite(shapes.e).any()]
+    def show(
+        self,
+        view: WhiskersView,
+        heights: HeightsView | None,
+        compared: WhiskersView | None,
+        beside: WhiskersView | None = None,
+    ) -> None:
+        """Draw whiskers, those of the state that is compared to below them; ones beside them have the same scale."""
+        shown = [shapes for shapes in (view, compared, beside) if shapes is not None]
+        drawn = [shapes.e for shapes in shown if np.isfinite(shapes.e).any()]
         key = _round_up(max([2e-3, *(float(np.nanquantile(e, 0.9)) for e in drawn)]))
         length = 0.11 * self._extent / key
         for source, shapes in ((self._whiskers, view), (self._compared, compared)):
@@ -323,9 +340,10 @@ class WhiskersPicture(Picture):
         x0, y0 = self._center[0] - self._extent, self._center[1] - 1.3 * self._extent
         self._key.data = {"x0": [x0], "y0": [y0], "x1": [x0 + length * key], "y1": [y0]}
         self._key_text.data = {"x": [x0], "y": [y0], "text": [f"e = {100 * key:.3g} %"]}
-        self.figure.title.text = view.method
+        self.figure.title.text = self._of + view.method
         of_heights = self.background == BACKGROUNDS[0]
-        values = view.fwhm_arcsec if self.background == BACKGROUNDS[1] else 100.0 * view.e
+        mapped = [v.fwhm_arcsec if self.background == BACKGROUNDS[1] else 100.0 * v.e for v in shown]
+        values = mapped[0]
         self._tiles.data = {
             "x": view.x_mm,
             "y": view.y_mm,
@@ -338,16 +356,24 @@ class WhiskersPicture(Picture):
         if of_heights and heights is not None:
             seen = np.abs(heights.height_um[np.isfinite(heights.height_um)])
             bound = max(float(np.quantile(seen, 0.99)) if len(seen) else 0.0, 1.0)
-            self.mapper.update(palette=_DIVERGING, low=-bound, high=bound)
-            half = heights.half_mm
-            image = np.float32(heights.height_um)
-            self._map.data = {"image": [image], "x": [-half], "y": [-half], "w": [2 * half], "h": [2 * half]}
+            self._map_to(_DIVERGING, -bound, bound)
+            if heights is not self._heights:
+                self._heights, half = heights, heights.half_mm
+                image = np.float32(heights.height_um)
+                self._map.data = {"image": [image], "x": [-half], "y": [-half], "w": [2 * half], "h": [2 * half]}
             self._bar.title = "height [um]"
         else:
-            finite = values[np.isfinite(values)]
+            finite = np.concatenate(mapped if beside is not None else mapped[:1])
+            finite = finite[np.isfinite(finite)]
             low, high = (float(v) for v in np.quantile(finite, [0.01, 0.99])) if len(finite) else (0.0, 1.0)
-            self.mapper.update(palette=Cividis256, low=low, high=high if high > low else low + 1e-3)
+            self._map_to(Cividis256, low, high if high > low else low + 1e-3)
             self._bar.title = "FWHM [arcsec]" if self.background == BACKGROUNDS[1] else "e [%]"
+
+    def _map_to(self, palette: Any, low: float, high: float) -> None:
+        # Bokeh takes milliseconds to check the colours of a palette.
+        if palette is not self._palette:
+            self._palette = self.mapper.palette = palette
+        self.mapper.update(low=low, high=high)
 
     def paint(self, theme: str) -> None:
         """Colour all but the data by a theme; whiskers stand out from the middle of the scale."""

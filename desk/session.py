@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import base64
 import binascii
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from time import monotonic
 from typing import Any
 
 import numpy as np
 from bokeh.document import Document
-from bokeh.events import DocumentReady
 from bokeh.layouts import column, row
 from bokeh.models import (
     Button,
+    CheckboxGroup,
     CustomJS,
+    Div,
     FileInput,
     Select,
     Slider,
@@ -24,12 +25,13 @@ from bokeh.models import (
 
 from ..core.errors import PachonError
 from .bench import Bench, Control
+from .page_session import PageSession
+from .panels import BesidePanel, MtfPanel, OptimizePanel, Panel, SensitivityPanel, SpacePanel
 from .pictures import (
     BACKGROUNDS,
     EnergyPicture,
     ImagePicture,
     OpdPicture,
-    Picture,
     SectionPicture,
     SpotsPicture,
     WhiskersPicture,
@@ -46,13 +48,14 @@ from .views import (
     WhiskersView,
     heights_view,
     images_view,
+    layout_of,
     numbers,
     opd_view,
     section_view,
     spots_view,
     whiskers_view,
 )
-from .widgets import FIRST_THEME, colour, number_boxes, status_line, status_text, theme_toggle
+from .widgets import colour, number_boxes, status_text
 
 #: Range of the lift of one CCD or raft [um].
 _LIFT = 50.0
@@ -73,13 +76,14 @@ URL.revokeObjectURL(link.href);
 """
 
 
-class Session:
+class Session(PageSession):
     """The desk of one page in a browser; two pages share nothing but the bench."""
 
     def __init__(self, bench: Bench, state: DeskState | None = None, document: Document | None = None) -> None:
-        self.bench, self.document = bench, document
-        self.title, self.subtitle = f"{bench.nominal.name}: desk", bench.nominal.description
+        super().__init__(f"{bench.nominal.name}: desk", bench.nominal.description, document)
+        self.bench = bench
         self.history = History(bench.check(state or bench.start))
+        self._last_scene = Scene.of(bench, self.history.state)
         self.views: dict[type, Any] = {}
         self.compared: dict[type, Any] = {}
         self.redraws = 0
@@ -106,18 +110,23 @@ class Session:
             tile /= np.sqrt(len(places) / len(camera))
         self.spots = SpotsPicture(np.rad2deg(self.bench.spot_fields), self._choose_field)
         self.opd, self.zernikes, self.energy = OpdPicture(), ZernikePicture(), EnergyPicture()
+
+        def new_whiskers(name: str, of: str) -> WhiskersPicture:
+            return WhiskersPicture(extent, tile, heights=camera is not None, name=name, of=of)
+
         self.optics = ImagePicture("optics", "Rays of the star, optics alone")
         self.seen = ImagePicture("seen", "Image of the star, with the atmosphere")
-        self.whiskers = WhiskersPicture(extent, tile, heights=camera is not None)
+        self.whiskers = new_whiskers("whiskers", "")
         self.section = SectionPicture()
-        first = (self.spots, self.whiskers, self.opd, self.zernikes)
-        self.pictures: tuple[Picture, ...] = (*first, self.optics, self.energy, self.section, self.seen)
-
-    def paint(self, theme: str) -> None:
-        """Colour the pictures by a theme."""
-        self.theme = theme
-        for picture in self.pictures:
-            picture.paint(theme)
+        self.beside = BesidePanel(self.bench, new_whiskers)
+        self.optimization = OptimizePanel(self.bench, lambda: self.scene, self.change, self._defer, self._say)
+        sensitivity = SensitivityPanel(lambda: self._draw_panel(sensitivity))
+        self.panels: tuple[Panel, ...] = (self.beside, MtfPanel(), sensitivity, self.optimization, SpacePanel())
+        now = (self.spots, self.whiskers, self.opd)
+        # Each picture of the pinned state stands beside that of the state.
+        pairs = [picture for pair in zip(now, self.beside.pictures, strict=True) for picture in pair]
+        others = [picture for panel in self.panels[1:] for picture in panel.pictures]
+        self.pictures = (*pairs, self.zernikes, self.optics, self.energy, self.section, *others, self.seen)
 
     def _choose_field(self, index: int) -> None:
         x, y = np.rad2deg(self.bench.spot_fields[index])
@@ -127,7 +136,6 @@ class Session:
     # Widgets
 
     def _make_widgets(self) -> None:
-        self.status, self.table = status_line()
         groups = list(dict.fromkeys(control.group for control in self.bench.controls))
         self.group = Select(title="Controls", value=groups[0], options=groups, sizing_mode="stretch_width")
         self.group.on_change("value", lambda attribute, old, new: self._show_group(new))
@@ -147,7 +155,6 @@ class Session:
         self.python = TextAreaInput(value="", visible=False)
         load = FileInput(accept=".yaml,.yml", title="Load a state (.yaml)", sizing_mode="stretch_width")
         load.on_change("value", lambda attribute, old, new: self._load(new))
-        self.theme_toggle = theme_toggle(self.paint)
         buttons = [
             row(_button("Undo", self.undo), _button("Redo", self.redo), _button("Reset", self.reset)),
             row(_button("Pin as A", self.pin), _button("Back to A", self.back_to_pinned), self.theme_toggle),
@@ -157,7 +164,13 @@ class Session:
             buttons.append(row(hide, _button("Reveal", self.reveal)))
         saved = _download("Save state", self.state_text, "desk.yaml")
         save = row(saved, _download("As Python", self.python, "desk.py"))
-        parts = [self.group, self.sliders, *buttons, self.background, self.density, save, load]
+        self.more = CheckboxGroup(labels=[panel.label for panel in self.panels], active=[])
+        self.more.on_change("active", lambda attribute, old, new: self.show_panels(new))
+        wanted = [widget for panel in self.panels for widget in panel.widgets]
+        for panel in self.panels:
+            panel.set_shown(False)
+        more = [Div(text="More pictures"), self.more, *wanted]
+        parts = [self.group, self.sliders, *buttons, *more, self.background, self.density, save, load]
         self.sidebar = column(*parts, self.state_text, self.python, name="sidebar", sizing_mode="stretch_width")
 
     def _show_group(self, group: str) -> None:
@@ -233,13 +246,14 @@ class Session:
     def change(self, state: DeskState, control: str = "") -> None:
         """Go to a state and draw it; one that is impossible is one line, and the last good one stays."""
         try:
-            Scene.of(self.bench, state)
+            scene = Scene.of(self.bench, state)
         except PachonError as error:
             self._say(error)
         else:
             self._say("")
             before = self.history.state
             self.history.push(state, control)
+            self._last_scene = scene
             self._follow(before)
         self._sync()
 
@@ -301,15 +315,46 @@ class Session:
         else:
             self.change(state)
 
+    def show_panels(self, active: Sequence[int]) -> None:
+        """Show the pictures of some panels, and hide those of the others."""
+        for number, panel in enumerate(self.panels):
+            panel.set_shown(number in active)
+        if self.beside.shown and not self.compared:
+            self.pin()
+        self.schedule()
+
+    def _draw_panel(self, panel: Panel) -> None:
+        if panel.shown:
+            try:
+                panel.draw(self.scene, self.views, self.compared)
+            except PachonError as error:
+                self._say(error)
+
+    def _defer(self, action: Callable[[], None]) -> None:
+        """Run an action when the page has drawn what it waits for; at once where there is no page."""
+        if self.document is None or self.document.session_context is None:
+            action()
+        else:
+            self.document.add_timeout_callback(action, _PAUSE)
+
     def _set_background(self, name: str) -> None:
-        self.whiskers.background = name
-        self.whiskers.paint(self.theme)
+        for picture in (self.whiskers, self.beside.whiskers):
+            picture.background = name
+            picture.paint(self.theme)
         self._show_whiskers()
+        self._draw_panel(self.beside)
 
     @property
     def state_words(self) -> str:
         """The state as a file of it has it."""
         return self.history.state.to_yaml()
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the state, made once for each."""
+        if self._last_scene.state != self.history.state:
+            self._last_scene = Scene.of(self.bench, self.history.state)
+        return self._last_scene
 
     # Drawing
 
@@ -335,7 +380,7 @@ class Session:
 
     def redraw_fast(self) -> None:
         """Draw spots, wavefront and coarse whiskers, which follow a slider."""
-        scene = Scene.of(self.bench, self.history.state)
+        scene = self.scene
         try:
             self.views[SpotsView] = spots_view(scene)
         except PachonError as error:
@@ -350,9 +395,9 @@ class Session:
             self._changed_heights = False
         self._update(WhiskersView, lambda: whiskers_view(scene))
         if SpotsView in self.views:
-            self.spots.show(self.views[SpotsView], scene.state.field_deg)
+            self.spots.show(self.views[SpotsView], scene.state.field_deg, self._beside(SpotsView))
         if OpdView in self.views:
-            self.opd.show(self.views[OpdView])
+            self.opd.show(self.views[OpdView], self._beside(OpdView))
             self.zernikes.show(self.views[OpdView], self.compared.get(OpdView))
         self._show_whiskers()
         self._show_numbers()
@@ -360,7 +405,7 @@ class Session:
 
     def redraw_slow(self) -> None:
         """Draw images, encircled energy, the section and fine whiskers."""
-        scene = Scene.of(self.bench, self.history.state)
+        scene = self.scene
         self._update(ImagesView, lambda: images_view(scene))
         if ImagesView in self.views:
             view = self.views[ImagesView]
@@ -371,13 +416,15 @@ class Session:
             self.energy.show(view, self.compared.get(ImagesView))
         if self._changed_geometry:
             try:
-                self.section.show(section_view(scene))
+                self.section.show(section_view(scene, layout_of(scene)))
             except PachonError as error:
                 self._say(error)
             self._changed_geometry = False
         if self.density.value != "1":
             self._update(WhiskersView, lambda: whiskers_view(scene, int(self.density.value)))
             self._show_whiskers()
+        for panel in self.panels:
+            self._draw_panel(panel)
         self._show_numbers()
         self.state_text.value = self.history.state.to_yaml()
         self.python.value = python_text(self.bench, self.history.state)
@@ -392,7 +439,12 @@ class Session:
     def _show_whiskers(self) -> None:
         if WhiskersView in self.views:
             view, compared = self.views[WhiskersView], self.compared.get(WhiskersView)
-            self.whiskers.show(view, self.views.get(HeightsView), compared)
+            over = None if self.beside.shown else compared
+            self.whiskers.show(view, self.views.get(HeightsView), over, self._beside(WhiskersView))
+
+    def _beside(self, kind: type) -> Any:
+        """Return the view of the pinned state that stands beside that of the state, None where none does."""
+        return self.compared.get(kind) if self.beside.shown else None
 
     def _show_numbers(self) -> None:
         now, then = (numbers(*(v.get(k) for k in _NUMBERED)) for v in (self.views, self.compared))
@@ -400,13 +452,6 @@ class Session:
 
     def _say(self, message: PachonError | str, *, error: bool = True) -> None:
         status_text(self.status, message, error=error)
-
-    def add_to(self, document: Document) -> None:
-        """Add the roots to the document of a page."""
-        colour(self.sidebar)
-        for root in (self.sidebar, self.status, self.table, *(picture.figure for picture in self.pictures)):
-            document.add_root(root)
-        document.js_on_event(DocumentReady, CustomJS(args={"toggle": self.theme_toggle}, code=FIRST_THEME))
 
 
 _NUMBERED = (SpotsView, OpdView, WhiskersView, ImagesView)

@@ -18,6 +18,11 @@ from ...wavefront.request import Request
 
 #: Points of a surface in section.
 _POINTS = 241
+#: Rings, diameters and points of each, of a surface that is drawn by lines; the last ring is just inside the rim.
+_LINE_RINGS = 4
+_DIAMETERS = 6
+_LINE_POINTS = 49
+_INSIDE = 0.999
 #: A medium of at least this index is drawn as glass.
 _GLASS = 1.05
 #: Radius of a surface without an aperture, over that of the light.
@@ -73,6 +78,25 @@ def surface_section(surface: Surface, reach: float) -> np.ndarray:
     sag = np.zeros_like(y) if surface.interaction == Interaction.PHASE else surface.shape.sag(np.zeros_like(y), y)
     local = np.stack([np.zeros_like(y), y, np.where(keep, sag, np.nan)], axis=-1)
     return surface.to_telescope(local)
+
+
+def surface_lines(surface: Surface, reach: float) -> list[np.ndarray]:
+    """Return rings and diameters of a surface out to a radius [m], telescope frame, each of shape [n, 3].
+
+    NaN breaks a line where the aperture cuts it; of a baffle, the blocking part counts.
+    """
+    angle = 2.0 * np.pi * np.arange(_LINE_POINTS) / (_LINE_POINTS - 1)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    lines = [_INSIDE * reach * (ring + 1) / _LINE_RINGS * circle for ring in range(_LINE_RINGS)]
+    across = np.linspace(-_INSIDE * reach, _INSIDE * reach, _LINE_POINTS)
+    turns = np.pi * np.arange(_DIAMETERS) / _DIAMETERS
+    lines += [np.stack([across * np.cos(turn), across * np.sin(turn)]) for turn in turns]
+    blocks = surface.interaction == Interaction.PASS
+    drawn = []
+    for x, y in lines:
+        points = surface.to_telescope(np.stack([x, y, surface.shape.sag(x, y)], axis=-1))
+        drawn.append(np.where((clear_region(surface.aperture, x, y) != blocks)[:, None], points, np.nan))
+    return drawn
 
 
 def clear_region(aperture: Aperture | None, x: np.ndarray, y: np.ndarray) -> np.ndarray:

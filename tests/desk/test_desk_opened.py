@@ -16,6 +16,7 @@ from pachon.desk.bench import Bench
 from pachon.desk.views import Scene, spots_view
 
 PICTURES = {"spots", "whiskers", "opd", "zernikes", "optics", "energy", "section", "seen"}
+PICTURES |= {"spots_a", "whiskers_a", "opd_a", "mtf", "sensitivity", "merit", "space"}
 
 
 @pytest.fixture(scope="module")

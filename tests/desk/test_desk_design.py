@@ -1,0 +1,115 @@
+"""Pictures of a design on the desk: MTF, sensitivities, optimisation, three dimensions, the pinned state beside."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pachon
+from pachon.core.errors import PachonError
+from pachon.desk.bench import Bench
+from pachon.desk.design_views import METRICS, improved, mtf_view, projected, sensitivity_view, space_view
+from pachon.desk.views import Scene, layout_of, opd_view, spots_view
+
+BENCH = Bench("lsst_v3.3_r")
+MOVED = replace(BENCH.start, optics={"M2_dz": 30.0, "M2_dx": 500.0})
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("metric", METRICS[:2])
+def test_sensitivities_are_differences_of_the_metric(metric):
+    view = sensitivity_view(Scene.of(BENCH, MOVED), metric)
+    # Derivatives are those at a fixed set of lit rays; steps are small, and errors of differences below 1e-3.
+    for name, step in (("M2_dz", 0.5), ("M1M3_B2", 0.01)):
+        low, high = (
+            sensitivity_view(Scene.of(BENCH, replace(MOVED, optics={**MOVED.optics, name: value})), metric).value
+            for value in (MOVED.optics.get(name, 0.0) - step, MOVED.optics.get(name, 0.0) + step)
+        )
+        index = view.names.index(name)
+        assert view.derivative[index] == pytest.approx((high - low) / (2.0 * step), rel=1e-3, abs=1e-3)
+        control = next(c for c in BENCH.controls if c.key == f"optics.{name}")
+        assert view.effect[index] == pytest.approx(view.derivative[index] * control.step)
+
+
+def test_sensitivities_begin_at_the_numbers_of_the_desk():
+    scene = Scene.of(BENCH, MOVED)
+    zernikes = opd_view(scene).zernikes_nm
+    # Both fits have the same terms; the rings of the pupil differ.
+    assert sensitivity_view(scene, "Z4 at the star").value == pytest.approx(zernikes[0], rel=1e-2)
+    radius = np.sqrt(np.mean(spots_view(scene).rms_um ** 2))
+    assert sensitivity_view(scene, METRICS[1]).value == pytest.approx(radius, rel=1e-6)
+
+
+@pytest.mark.long
+def test_the_transfer_is_that_of_the_python_api():
+    scene = Scene.of(BENCH, MOVED)
+    view = mtf_view(scene)
+    result = pachon.mtf(scene.telescope, np.deg2rad(MOVED.field_deg), MOVED.wavelength_nm * 1e-9)
+    np.testing.assert_allclose(view.tangential, result.tangential[0], atol=1e-9)
+    np.testing.assert_allclose(view.frequency, result.frequency * 1e-3)
+
+
+@pytest.mark.long
+def test_an_optimisation_finds_the_misalignment_that_optimize_finds():
+    better = improved(Scene.of(BENCH, MOVED), ["M2_dz", "M2_dx"])
+    expected = pachon.optimize(
+        Scene.of(BENCH, MOVED).telescope,
+        ["M2.dz", "M2.dx"],
+        fields=BENCH.spot_fields,
+        wavelengths=MOVED.wavelength_nm * 1e-9,
+    )
+    assert better.before_um == pytest.approx(1e6 * expected.merits[0], rel=1e-9)
+    # Some steps go most of the way; the rest is that of the next ones.
+    assert better.after_um == pytest.approx(1e6 * expected.merits[1], rel=1e-3)
+    assert better.state.optics["M2_dz"] == pytest.approx(30.0 + 1e6 * expected.changes[0], abs=0.1)
+    with pytest.raises(PachonError):
+        improved(Scene.of(BENCH, MOVED), [])
+
+
+def test_bending_modes_are_no_variables():
+    assert set(BENCH.variables) == {f"{b}_{m}" for b in ("M2", "Camera") for m in ("dx", "dy", "dz", "rx", "ry")}
+
+
+def test_a_view_in_space_has_its_axes():
+    axes = np.eye(3)
+    # From +x: +y to the right and +z up. From above, turned by a right angle: -x to the right, -y up.
+    np.testing.assert_allclose(projected(axes, 0.0, 0.0), [[0, 0], [1, 0], [0, 1]], atol=1e-15)
+    np.testing.assert_allclose(projected(axes, np.pi / 2, np.pi / 2), [[-1, 0], [0, -1], [0, 0]], atol=1e-15)
+
+
+def test_lines_lie_on_the_surfaces_within_their_apertures():
+    lines = space_view(layout_of(Scene.of(BENCH, BENCH.start)))
+    surface = BENCH.nominal.surface("M1")
+    points = np.concatenate([line.points for line in lines if line.name == "M1"])
+    x, y, z = surface.to_local(points[np.isfinite(points).all(axis=1)]).T
+    np.testing.assert_allclose(z, surface.shape.sag(x, y), atol=1e-12)
+    assert np.hypot(x, y).min() >= surface.aperture.inner
+    assert {line.kind for line in lines} >= {"ray", "mirror", "refract", "detector"}
+
+
+@pytest.mark.long
+def test_panels_draw_where_they_are_shown_and_an_optimisation_is_one_step_to_undo():
+    pytest.importorskip("bokeh", reason="a desk needs Bokeh: pip install 'pachon[desk]'")
+    from pachon.desk.session import Session
+
+    bench = Bench(pachon.new_telescope("triplet"))
+    start = {"S3_radius": 0.2}
+    session = Session(bench, replace(bench.start, optics=start))
+    by_label = {panel.label: panel for panel in session.panels}
+    assert not any(picture.figure.visible for panel in session.panels for picture in panel.pictures)
+    session.show_panels(range(len(session.panels)))
+    assert session.status.text == ""
+    mtf = by_label["MTF"].picture.source.data
+    np.testing.assert_array_equal(mtf["t"], mtf_view(session.scene).tangential)
+    bars = by_label["Sensitivities"].picture.source.data
+    assert len(bars["name"]) == 16
+    # The pinned state is on the scale of the state.
+    session.set_value("optics.S3_radius", 0.1)
+    assert session.beside.opd.mapper.high == session.opd.mapper.high
+    np.testing.assert_array_equal(session.beside.opd.source.data["image"][0].shape, (64, 64))
+    panel = session.optimization
+    panel.variables.value = ["S3_radius"]
+    panel.start()
+    assert not panel.running
+    assert panel.merits[-1] < 0.5 * panel.merits[0]
+    assert session.history.undo().optics == {"S3_radius": 0.1}
