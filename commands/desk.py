@@ -21,7 +21,7 @@ def desk_command(
     model: Annotated[
         str,
         names(
-            completion.either(completion.bundled_models, completion.files(*completion.LENSES)),
+            completion.models,
             metavar="MODEL|FILE|RUN|SWEEP",
             help="Bundled telescope, its file, a state that a desk saved (.yaml), the folder of a run, or a sweep.",
             kind=typer.Argument,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from bokeh.server.server import Server
 
     from .bench import Bench
-    from .page import DeskSession
+    from .page_session import PageSession
     from .state import DeskState
     from .sweep_views import SweepBench
 
@@ -35,7 +35,7 @@ class Desk:
     :meth:`close`. It draws between the cells, while the kernel is idle.
     """
 
-    def __init__(self, name: str, new_session: Callable[[Document | None], DeskSession]) -> None:
+    def __init__(self, name: str, new_session: Callable[[Document | None], PageSession]) -> None:
         self.name, self._new_session = name, new_session
         self._server: Server | None = None
         self._address = ""
@@ -144,7 +144,7 @@ def open_desk(source: str | os.PathLike[str] | Telescope = "lsst_v3.3_r") -> Des
     return Desk(bench.nominal.name, lambda document: Session(bench, state, document))
 
 
-def _sweep_session(sweep: SweepBench, document: Document | None) -> DeskSession:
+def _sweep_session(sweep: SweepBench, document: Document | None) -> PageSession:
     """Return the session of a sweep, or of the point that the address of the page asks for."""
     from .session import Session
     from .sweep_session import SweepSession

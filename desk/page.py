@@ -12,12 +12,8 @@ from bokeh.resources import INLINE
 from jinja2 import ChoiceLoader, Environment, FileSystemLoader, Template
 
 from ..core.files import write_bytes
-from .run_session import RunSession
-from .session import Session
-from .sweep_session import SweepSession
+from .page_session import PageSession
 
-#: A session of any kind of page.
-DeskSession = Session | RunSession | SweepSession
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
@@ -28,7 +24,7 @@ def template() -> Template:
     return Environment(loader=loader, autoescape=True).get_template("desk.html")
 
 
-def page_names(session: DeskSession, *, live: bool) -> dict[str, Any]:
+def page_names(session: PageSession, *, live: bool) -> dict[str, Any]:
     """Return what the template fills in."""
     names = [str(picture.figure.name) for picture in session.pictures]
     return {
@@ -41,7 +37,7 @@ def page_names(session: DeskSession, *, live: bool) -> dict[str, Any]:
     }
 
 
-def show_in(session: DeskSession, document: Document) -> None:
+def show_in(session: PageSession, document: Document) -> None:
     """Make a document the page of a session."""
     document.template = template()
     document.title = session.title
@@ -49,7 +45,7 @@ def show_in(session: DeskSession, document: Document) -> None:
     session.add_to(document)
 
 
-def export_page(session: DeskSession, path: Path) -> None:
+def export_page(session: PageSession, path: Path) -> None:
     """Write the pictures and numbers of a session as one page that needs no network."""
     pictures = [picture.figure for picture in session.pictures if picture.figure.visible]
     names = page_names(session, live=False)

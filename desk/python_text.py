@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from ..sky.visit_list.seeing import KOLMOGOROV_WIDTH, WAVELENGTH
 from .bench import Bench, height_factors
 from .state import DeskState
-from .views import KOLMOGOROV, RINGS, SEEING_WAVELENGTH, SITE
+from .views import RINGS, SITE
 
 
 def python_text(bench: Bench, state: DeskState) -> str:
@@ -29,7 +30,7 @@ def python_text(bench: Bench, state: DeskState) -> str:
             lines.append(f"focal_plane = focal_plane.with_moved({name!r}, dz={lift!r} * 1e-6)")
     lines.append("atmosphere = None")
     if state.seeing_arcsec > 0:
-        r0 = f"{KOLMOGOROV} * {SEEING_WAVELENGTH} / np.deg2rad({state.seeing_arcsec!r} / 3600)"
+        r0 = f"{KOLMOGOROV_WIDTH} * {WAVELENGTH} / np.deg2rad({state.seeing_arcsec!r} / 3600)"
         lines.append(f"atmosphere = pachon.Atmosphere.from_site({SITE!r}, 1, r0={r0})")
     rings = f"n_pupil={RINGS}, focal_plane=focal_plane"
     lines += [

@@ -8,18 +8,20 @@ from typing import Any
 
 import numpy as np
 from bokeh.document import Document
-from bokeh.events import DocumentReady, Tap
+from bokeh.events import Tap
 from bokeh.layouts import column
-from bokeh.models import ColumnDataSource, CustomJS, FixedTicker, RangeSlider, Select, Span, Whisker
+from bokeh.models import ColumnDataSource, FixedTicker, RangeSlider, Select, Span, Whisker
 
 from ..core.errors import PachonError
+from ..measure.correlation import Correlation
+from .page_session import PageSession
 from .pictures import BLUE, ORANGE, MapPicture, Picture, WhiskersPicture, diverging_palette
-from .run_views import KINDS, CorrelationView, RunBench, RunState, StampsView
+from .run_views import KINDS, RunBench, RunState, StampsView
 from .run_views import run_correlation as correlation_of
 from .run_views import run_numbers as numbers_of
 from .run_views import run_stamps as stamps_of
 from .run_views import run_whiskers as whiskers_of
-from .widgets import FIRST_THEME, colour, number_boxes, status_line, status_text, theme_toggle
+from .widgets import number_boxes, status_text
 
 #: Half of the side of a CCD, about [mm].
 _CCD = 22.0
@@ -50,7 +52,9 @@ class CorrelationPicture(Picture):
     """The correlation function of the selection."""
 
     def __init__(self) -> None:
-        super().__init__("xi", "Correlation of the selection", "separation [arcmin]", "xi+", square=False, log_x=True)
+        super().__init__(
+            "xi", "Correlation of the selection, adaptive g", "separation [arcmin]", "xi+", square=False, log_x=True
+        )
         self.source = ColumnDataSource({"r": [], "xi": [], "low": [], "high": []})
         self.figure.line("r", "xi", source=self.source, color=BLUE, line_width=1.5)
         self.figure.scatter("r", "xi", source=self.source, color=BLUE, size=7)
@@ -60,18 +64,18 @@ class CorrelationPicture(Picture):
         self.figure.add_layout(bars)
         self.figure.add_layout(Span(location=0.0, dimension="width", line_color=ORANGE, line_dash="dashed"))
 
-    def show(self, view: CorrelationView) -> None:
+    def show(self, view: Correlation) -> None:
         """Draw points with their errors."""
-        low, high = view.xi_plus - view.error, view.xi_plus + view.error
+        low, high = view.xi_plus - view.error_plus, view.xi_plus + view.error_plus
         self.source.data = {"r": view.r_arcmin, "xi": view.xi_plus, "low": low, "high": high}
 
 
-class RunSession:
+class RunSession(PageSession):
     """The desk of a run on one page."""
 
     def __init__(self, bench: RunBench, document: Document | None = None) -> None:
-        self.bench, self.document, self.state = bench, document, bench.start
-        self.title, self.subtitle = f"{bench.folder.resolve().name}: desk of a run", f"{len(bench.ccds)} CCDs"
+        super().__init__(f"{bench.folder.resolve().name}: desk of a run", f"{len(bench.ccds)} CCDs", document)
+        self.bench, self.state = bench, bench.start
         low, high = bench.centers_mm.min(axis=0), bench.centers_mm.max(axis=0)
         extent, (x, y) = 0.5 * float((high - low).max()) + _CCD, (0.5 * (low + high)).tolist()
         self.whiskers = WhiskersPicture(extent, 0.02 * extent, heights=False, center_mm=(x, y))
@@ -92,7 +96,6 @@ class RunSession:
         )
 
     def _make_widgets(self) -> None:
-        self.status, self.table = status_line()
         low, high = self.state.magnitudes
         self.kind = Select(title="Shapes", value=self.state.kind, options=list(KINDS))
         self.kind.on_change("value", lambda attribute, old, new: self.change(kind=new))
@@ -101,16 +104,10 @@ class RunSession:
         self.magnitudes = RangeSlider(title="Magnitudes of observed stars [AB]", start=low, end=high, step=0.1)
         self.magnitudes.value = (low, high)
         self.magnitudes.on_change("value_throttled", lambda attribute, old, new: self.change(magnitudes=tuple(new)))
-        self.theme_toggle = theme_toggle(self.paint)
         for widget in (self.kind, self.ccd, self.magnitudes):
             widget.sizing_mode = "stretch_width"
         parts = [self.kind, self.ccd, self.magnitudes, self.theme_toggle]
         self.sidebar = column(*parts, name="sidebar", sizing_mode="stretch_width")
-
-    def paint(self, theme: str) -> None:
-        """Colour the pictures by a theme."""
-        for picture in self.pictures:
-            picture.paint(theme)
 
     def change(self, **values: Any) -> None:
         """Change the selection; one that is impossible is one line, and the last good one stays."""
@@ -143,10 +140,3 @@ class RunSession:
         status_text(self.status, "")
         self.table.text = number_boxes(numbers_of(made[0], len(self.bench.ccds)), {})
         return True
-
-    def add_to(self, document: Document) -> None:
-        """Add the roots to the document of a page."""
-        colour(self.sidebar)
-        for root in (self.sidebar, self.status, self.table, *(picture.figure for picture in self.pictures)):
-            document.add_root(root)
-        document.js_on_event(DocumentReady, CustomJS(args={"toggle": self.theme_toggle}, code=FIRST_THEME))

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import DomainError, ProductError, unknown_name
+from ..core.statistics import FWHM_PER_RMS, finite_median, rms
 from ..core.units import ARCSEC
-from ..measure.correlation import SeparationBins, shear_correlation
+from ..measure.correlation import Correlation, SeparationBins, shear_correlation
 from ..reconstruction.ccd_product import CcdStars, Stars, product_path, read_product
-from .views import FWHM, WhiskersView
+from .views import WhiskersView
 
 #: What is shown of the stars.
 KINDS = ("noise-free", "observed", "model", "observed - model", "noise-free - model")
@@ -40,15 +41,6 @@ class StampsView:
     image: np.ndarray  #: parts of the brightest pixel of each star, rows star, model, difference from above
     stars: int  #: columns
     side_arcsec: float  #: side of a stamp [arcsec]
-
-
-@dataclass(frozen=True)
-class CorrelationView:
-    """Correlation of the ellipticities that are shown."""
-
-    r_arcmin: np.ndarray
-    xi_plus: np.ndarray
-    error: np.ndarray
 
 
 class RunBench:
@@ -106,7 +98,7 @@ def _columns(bench: RunBench, state: RunState, *names: str) -> list[np.ndarray]:
 
     columns = []
     for name in names:
-        if name not in ("e1", "e2", "size"):
+        if name not in ("g1", "g2", "sigma"):
             columns.append(column(name))
         elif state.kind == "model":
             columns.append(column(f"model_{name}"))
@@ -116,23 +108,23 @@ def _columns(bench: RunBench, state: RunState, *names: str) -> list[np.ndarray]:
 
 
 def run_whiskers(bench: RunBench, state: RunState) -> WhiskersView:
-    """Return the shapes of the selected stars at their places; sizes as FWHM of Gaussians of those moments."""
-    x, y, e1, e2, size = _columns(bench, state, "x", "y", "e1", "e2", "size")
-    good = np.isfinite(e1) & np.isfinite(e2)
-    title = f"Whiskers, {state.kind}: {np.count_nonzero(good)} stars"
-    return WhiskersView(1e3 * x[good], 1e3 * y[good], e1[good], e2[good], FWHM * size[good] / ARCSEC, title)
+    """Return the adaptive moments of the selected stars at their places; sizes as FWHM of those Gaussians."""
+    x, y, g1, g2, sigma = _columns(bench, state, "x", "y", "g1", "g2", "sigma")
+    good = np.isfinite(g1) & np.isfinite(g2)
+    title = f"Whiskers, {state.kind}: adaptive moments of {np.count_nonzero(good)} stars"
+    fwhm = FWHM_PER_RMS * sigma[good] / ARCSEC
+    return WhiskersView(1e3 * x[good], 1e3 * y[good], g1[good], g2[good], fwhm, title)
 
 
-def run_correlation(bench: RunBench, state: RunState) -> CorrelationView:
-    """Return the correlation function xi+ of the selected ellipticities."""
-    x, y, e1, e2 = _columns(bench, state, "field_x", "field_y", "e1", "e2")
-    good = np.isfinite(e1) & np.isfinite(e2)
+def run_correlation(bench: RunBench, state: RunState) -> Correlation:
+    """Return the correlation function xi+ of the selected ellipticities, those of adaptive moments."""
+    x, y, g1, g2 = _columns(bench, state, "field_x", "field_y", "g1", "g2")
+    good = np.isfinite(g1) & np.isfinite(g2)
     if np.count_nonzero(good) < _FEWEST:
         raise DomainError(f"{np.count_nonzero(good)} stars are selected: expected {_FEWEST} for a correlation")
     longest = max(float(np.hypot(np.ptp(x[good]), np.ptp(y[good]))), 4.0 * _SHORTEST)
     bins = SeparationBins(_SHORTEST, longest, _BINS)
-    result = shear_correlation(x[good], y[good], e1[good], e2[good], bins=bins)
-    return CorrelationView(result.r / (60.0 * ARCSEC), result.xi_plus, result.error_plus)
+    return shear_correlation(x[good], y[good], g1[good], g2[good], bins=bins)
 
 
 def run_stamps(bench: RunBench, state: RunState) -> StampsView:
@@ -171,7 +163,6 @@ def run_numbers(view: WhiskersView, ccds: int) -> dict[str, tuple[float, str]]:
     """Return the numbers of a selection, with their units."""
     table = {"stars": (float(len(view.e1)), ""), "CCDs": (float(ccds), "")}
     if len(view.e1):
-        rms = 100.0 * float(np.sqrt(np.mean(view.e1**2 + view.e2**2)))
-        table["ellipticity, rms"] = (rms, "%")
-        table["FWHM of the weighted size, median"] = (float(np.nanmedian(view.fwhm_arcsec)), "arcsec")
+        table["adaptive ellipticity g, rms"] = (100.0 * rms(view.e), "%")
+        table["FWHM of the adaptive size, median"] = (finite_median(view.fwhm_arcsec), "arcsec")
     return table

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from bokeh.document import Document
-from bokeh.events import DocumentReady
 from bokeh.layouts import column, row
 from bokeh.models import (
     Button,
@@ -24,12 +23,12 @@ from bokeh.models import (
 
 from ..core.errors import PachonError
 from .bench import Bench, Control
+from .page_session import PageSession
 from .pictures import (
     BACKGROUNDS,
     EnergyPicture,
     ImagePicture,
     OpdPicture,
-    Picture,
     SectionPicture,
     SpotsPicture,
     WhiskersPicture,
@@ -52,7 +51,7 @@ from .views import (
     spots_view,
     whiskers_view,
 )
-from .widgets import FIRST_THEME, colour, number_boxes, status_line, status_text, theme_toggle
+from .widgets import colour, number_boxes, status_text
 
 #: Range of the lift of one CCD or raft [um].
 _LIFT = 50.0
@@ -73,13 +72,14 @@ URL.revokeObjectURL(link.href);
 """
 
 
-class Session:
+class Session(PageSession):
     """The desk of one page in a browser; two pages share nothing but the bench."""
 
     def __init__(self, bench: Bench, state: DeskState | None = None, document: Document | None = None) -> None:
-        self.bench, self.document = bench, document
-        self.title, self.subtitle = f"{bench.nominal.name}: desk", bench.nominal.description
+        super().__init__(f"{bench.nominal.name}: desk", bench.nominal.description, document)
+        self.bench = bench
         self.history = History(bench.check(state or bench.start))
+        self._last_scene = Scene.of(bench, self.history.state)
         self.views: dict[type, Any] = {}
         self.compared: dict[type, Any] = {}
         self.redraws = 0
@@ -111,13 +111,7 @@ class Session:
         self.whiskers = WhiskersPicture(extent, tile, heights=camera is not None)
         self.section = SectionPicture()
         first = (self.spots, self.whiskers, self.opd, self.zernikes)
-        self.pictures: tuple[Picture, ...] = (*first, self.optics, self.energy, self.section, self.seen)
-
-    def paint(self, theme: str) -> None:
-        """Colour the pictures by a theme."""
-        self.theme = theme
-        for picture in self.pictures:
-            picture.paint(theme)
+        self.pictures = (*first, self.optics, self.energy, self.section, self.seen)
 
     def _choose_field(self, index: int) -> None:
         x, y = np.rad2deg(self.bench.spot_fields[index])
@@ -127,7 +121,6 @@ class Session:
     # Widgets
 
     def _make_widgets(self) -> None:
-        self.status, self.table = status_line()
         groups = list(dict.fromkeys(control.group for control in self.bench.controls))
         self.group = Select(title="Controls", value=groups[0], options=groups, sizing_mode="stretch_width")
         self.group.on_change("value", lambda attribute, old, new: self._show_group(new))
@@ -147,7 +140,6 @@ class Session:
         self.python = TextAreaInput(value="", visible=False)
         load = FileInput(accept=".yaml,.yml", title="Load a state (.yaml)", sizing_mode="stretch_width")
         load.on_change("value", lambda attribute, old, new: self._load(new))
-        self.theme_toggle = theme_toggle(self.paint)
         buttons = [
             row(_button("Undo", self.undo), _button("Redo", self.redo), _button("Reset", self.reset)),
             row(_button("Pin as A", self.pin), _button("Back to A", self.back_to_pinned), self.theme_toggle),
@@ -233,13 +225,14 @@ class Session:
     def change(self, state: DeskState, control: str = "") -> None:
         """Go to a state and draw it; one that is impossible is one line, and the last good one stays."""
         try:
-            Scene.of(self.bench, state)
+            scene = Scene.of(self.bench, state)
         except PachonError as error:
             self._say(error)
         else:
             self._say("")
             before = self.history.state
             self.history.push(state, control)
+            self._last_scene = scene
             self._follow(before)
         self._sync()
 
@@ -311,6 +304,13 @@ class Session:
         """The state as a file of it has it."""
         return self.history.state.to_yaml()
 
+    @property
+    def scene(self) -> Scene:
+        """The scene of the state, made once for each."""
+        if self._last_scene.state != self.history.state:
+            self._last_scene = Scene.of(self.bench, self.history.state)
+        return self._last_scene
+
     # Drawing
 
     def schedule(self) -> None:
@@ -335,7 +335,7 @@ class Session:
 
     def redraw_fast(self) -> None:
         """Draw spots, wavefront and coarse whiskers, which follow a slider."""
-        scene = Scene.of(self.bench, self.history.state)
+        scene = self.scene
         try:
             self.views[SpotsView] = spots_view(scene)
         except PachonError as error:
@@ -360,7 +360,7 @@ class Session:
 
     def redraw_slow(self) -> None:
         """Draw images, encircled energy, the section and fine whiskers."""
-        scene = Scene.of(self.bench, self.history.state)
+        scene = self.scene
         self._update(ImagesView, lambda: images_view(scene))
         if ImagesView in self.views:
             view = self.views[ImagesView]
@@ -400,13 +400,6 @@ class Session:
 
     def _say(self, message: PachonError | str, *, error: bool = True) -> None:
         status_text(self.status, message, error=error)
-
-    def add_to(self, document: Document) -> None:
-        """Add the roots to the document of a page."""
-        colour(self.sidebar)
-        for root in (self.sidebar, self.status, self.table, *(picture.figure for picture in self.pictures)):
-            document.add_root(root)
-        document.js_on_event(DocumentReady, CustomJS(args={"toggle": self.theme_toggle}, code=FIRST_THEME))
 
 
 _NUMBERED = (SpotsView, OpdView, WhiskersView, ImagesView)

@@ -44,7 +44,7 @@ class DeskState:
     field_deg : tuple of float
         Field angles of the star that wavefront, PSF and encircled energy are of [deg].
     seeing_arcsec : float
-        FWHM of the atmosphere at 500 nm by its Fried parameter, 0.976 wavelengths over r0 [arcsec]; 0 without one.
+        FWHM of the atmosphere at 500 nm by its Fried parameter, 0.9759 wavelengths over r0 [arcsec]; 0 without one.
     """
 
     model: str
@@ -121,12 +121,12 @@ class DeskState:
     @classmethod
     def from_yaml(cls, text: str, source: str = "state") -> DeskState:
         """Read a state; text of another version or with wrong keys is a ConfigError of one line."""
-        from ..core.yaml_reader import loaded
+        from ..core.yaml_reader import read_value
 
         try:
-            content = loaded(text)
-        except yaml.YAMLError:
-            raise ConfigError("expected YAML, as the desk saves it", file=source) from None
+            content = read_value(text)
+        except ValueError as error:
+            raise ConfigError(f"expected YAML, as the desk saves it: {error}", file=source) from None
         if not isinstance(content, dict) or "desk" not in content:
             raise ConfigError("desk: expected the state of a desk, which begins with its version", file=source)
         if content.pop("desk") != VERSION:

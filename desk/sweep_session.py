@@ -6,16 +6,16 @@ from typing import Any
 
 import numpy as np
 from bokeh.document import Document
-from bokeh.events import DocumentReady
 from bokeh.layouts import column
 from bokeh.models import Button, ColumnDataSource, CustomJS, FixedTicker, HoverTool, Select, Span, Spinner
 from bokeh.models.tools import BoxSelectTool, TapTool
 from bokeh.transform import dodge
 
 from ..core.errors import PachonError
+from .page_session import PageSession
 from .pictures import BLUE, GREEN, GREY, ORANGE, Picture
 from .sweep_views import SweepBench, TornadoView
-from .widgets import FIRST_THEME, colour, number_boxes, status_line, status_text, theme_toggle
+from .widgets import number_boxes, status_text
 
 #: Parameters with a plot of their own, at most.
 _MOST_PLOTS = 8
@@ -74,14 +74,14 @@ class TornadoPicture(Picture):
         self.figure.title.text = "Effects of the parameters"
 
 
-class SweepSession:
+class SweepSession(PageSession):
     """The desk of a sweep on one page."""
 
     def __init__(self, bench: SweepBench, document: Document | None = None, message: str = "") -> None:
-        self.bench, self.document = bench, document
         count = len(bench.table)
-        self.title = f"{bench.table.name}: desk of a sweep"
-        self.subtitle = f"{count} points, {len(bench.table.parameters)} parameters, {len(bench.metrics)} metrics"
+        parts = f"{count} points, {len(bench.table.parameters)} parameters, {len(bench.metrics)} metrics"
+        super().__init__(f"{bench.table.name}: desk of a sweep", parts, document)
+        self.bench = bench
         self.metric = next(iter(bench.metrics))
         self.other = list(bench.metrics)[min(1, len(bench.metrics) - 1)]
         names = list(bench.parameters)[:_MOST_PLOTS]
@@ -94,7 +94,7 @@ class SweepSession:
         ]
         self.against = PointsPicture("other", self.source, "other", (bench.label(self.other), y))
         self.tornado = TornadoPicture()
-        self.pictures: tuple[Picture, ...] = (*self.plots, self.against, self.tornado)
+        self.pictures = (*self.plots, self.against, self.tornado)
         self._make_widgets()
         self.paint("light")
         self.redraw()
@@ -106,7 +106,6 @@ class SweepSession:
         return f"{self.bench.table.name}: {self.bench.label(self.metric)}"
 
     def _make_widgets(self) -> None:
-        self.status, self.table = status_line()
         metrics = list(self.bench.metrics)
         self.metric_select = Select(title="Metric", value=self.metric, options=metrics)
         self.other_select = Select(title="Against the metric", value=self.other, options=metrics)
@@ -117,16 +116,10 @@ class SweepSession:
         self.point = Spinner(title="Point; or click one", value=first, low=0, step=1)
         self.open = Button(label="Open this telescope")
         self.open.js_on_click(CustomJS(args={"number": self.point}, code=_OPEN))
-        self.theme_toggle = theme_toggle(self.paint)
         parts: list[Any] = [self.metric_select, self.other_select, self.point, self.open]
         for widget in parts:
             widget.sizing_mode = "stretch_width"
         self.sidebar = column(*parts, self.theme_toggle, name="sidebar", sizing_mode="stretch_width")
-
-    def paint(self, theme: str) -> None:
-        """Colour the pictures by a theme."""
-        for picture in self.pictures:
-            picture.paint(theme)
 
     def change(self, axis: str, metric: str) -> None:
         """Draw another metric, or the metric against another one."""
@@ -154,10 +147,3 @@ class SweepSession:
         except PachonError as error:
             status_text(self.status, error)
         self._show_numbers()
-
-    def add_to(self, document: Document) -> None:
-        """Add the roots to the document of a page."""
-        colour(self.sidebar)
-        for root in (self.sidebar, self.status, self.table, *(picture.figure for picture in self.pictures)):
-            document.add_root(root)
-        document.js_on_event(DocumentReady, CustomJS(args={"toggle": self.theme_toggle}, code=FIRST_THEME))

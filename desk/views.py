@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.errors import DomainError
+from ..core.statistics import FWHM_PER_RMS, finite_median
 from ..core.units import ARCSEC
 from ..design.images.encircled_energy import energy_curve
 from ..design.layout.layout import Layout, layout
@@ -15,6 +16,8 @@ from ..design.metrics.field_zernikes import wavefront_zernikes
 from ..design.metrics.spots import spots
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
+from ..sky.visit_list.seeing import KOLMOGOROV_WIDTH
+from ..sky.visit_list.seeing import WAVELENGTH as SEEING_WAVELENGTH
 from ..wavefront.atmosphere.atmosphere import Atmosphere
 from ..wavefront.opd import wavefront_opd
 from ..wavefront.psf.psf import make_psfs
@@ -24,11 +27,6 @@ from ..wavefront.request import Request
 from .bench import Bench
 from .state import DeskState
 
-#: FWHM of a Gaussian over its rms width.
-FWHM = math.sqrt(8.0 * math.log(2.0))
-#: FWHM of a Kolmogorov image over wavelength / r0, and the wavelength of the seeing [m].
-KOLMOGOROV = 0.976
-SEEING_WAVELENGTH = 500e-9
 #: Rings of pupil points of spots.
 RINGS = 6
 #: Cells across the pupil of the OPD map, and the highest Zernike term.
@@ -75,7 +73,7 @@ def atmosphere(seeing_arcsec: float) -> Atmosphere | None:
     """Return the atmosphere of a seeing; None for zero."""
     if not seeing_arcsec > 0.0:
         return None
-    r0 = KOLMOGOROV * SEEING_WAVELENGTH / (seeing_arcsec * ARCSEC)
+    r0 = KOLMOGOROV_WIDTH * SEEING_WAVELENGTH / (seeing_arcsec * ARCSEC)
     return Atmosphere.from_site(SITE, 1, r0=r0)
 
 
@@ -179,14 +177,14 @@ def _ray_whiskers(scene: Scene, places: np.ndarray, star_fields: np.ndarray) -> 
         xx, yy, xy = (np.sum(weight * away[..., i] * away[..., j], axis=1) for i, j in ((0, 0), (1, 1), (0, 1)))
         xx, yy, xy = (moment / weight.sum(axis=1) for moment in (xx, yy, xy))
         # Kolmogorov's FWHM falls with the fifth root of the wavelength.
-        air = (scene.state.seeing_arcsec * (scene.wavelength / SEEING_WAVELENGTH) ** -0.2 / FWHM) ** 2
+        air = (scene.state.seeing_arcsec * (scene.wavelength / SEEING_WAVELENGTH) ** -0.2 / FWHM_PER_RMS) ** 2
         xx, yy = xx + air, yy + air
         root = np.sqrt(np.maximum(xx * yy - xy**2, 0.0))
         norm = xx + yy + 2.0 * root
         e1, e2 = (xx - yy) / norm, 2.0 * xy / norm
     method = "Whiskers: second moments of rays" + " and seeing" * (air > 0)
     x_mm, y_mm = places.T * 1e3
-    return WhiskersView(x_mm, y_mm, e1, e2, FWHM * np.sqrt(root), method)
+    return WhiskersView(x_mm, y_mm, e1, e2, FWHM_PER_RMS * np.sqrt(root), method)
 
 
 def _weighted_whiskers(scene: Scene, places: np.ndarray, star_fields: np.ndarray) -> WhiskersView:
@@ -202,7 +200,7 @@ def _weighted_whiskers(scene: Scene, places: np.ndarray, star_fields: np.ndarray
     e1, e2, size = (moments.g1, moments.g2, moments.sigma) if air else (moments.e1, moments.e2, moments.size)
     method = "Whiskers: adaptive moments" if air else "Whiskers: optics, weight of 0.3 arcsec"
     x_mm, y_mm = places.T * 1e3
-    return WhiskersView(x_mm, y_mm, e1, e2, FWHM * size / ARCSEC, method)
+    return WhiskersView(x_mm, y_mm, e1, e2, FWHM_PER_RMS * size / ARCSEC, method)
 
 
 def stamps_of(scene: Scene) -> Stamps:
@@ -333,21 +331,17 @@ def numbers(
     """Return the numbers that stand beside the pictures, with their units; those of missing views are left out."""
     table: dict[str, tuple[float, str]] = {}
     if spots_now is not None:
-        table["spot rms radius, median"] = (_median(spots_now.rms_um), "um")
-        table["spot rms radius, median on the sky"] = (_median(spots_now.rms_arcsec), "arcsec")
+        table["spot rms radius, median"] = (finite_median(spots_now.rms_um), "um")
+        table["spot rms radius, median on the sky"] = (finite_median(spots_now.rms_arcsec), "arcsec")
         table["spot rms radius, largest"] = (float(np.nanmax(spots_now.rms_um, initial=0.0)), "um")
     if opd is not None:
         table["wavefront rms at the star"] = (opd.rms_nm, "nm")
     if whiskers is not None:
-        table["FWHM, median"] = (_median(whiskers.fwhm_arcsec), "arcsec")
-        table["ellipticity, median"] = (100.0 * _median(whiskers.e), "%")
+        table["FWHM, median"] = (finite_median(whiskers.fwhm_arcsec), "arcsec")
+        table["ellipticity, median"] = (100.0 * finite_median(whiskers.e), "%")
     if images is not None:
         curve = images.optics_energy if images.seen_energy is None else images.seen_energy
         reached = curve >= 0.8
         radius = float(np.interp(0.8, curve, images.radius_arcsec)) if reached.any() else math.nan
         table["80 % of the light at the star within"] = (radius, "arcsec")
     return table
-
-
-def _median(values: np.ndarray) -> float:
-    return float(np.nanmedian(values)) if np.isfinite(values).any() else math.nan

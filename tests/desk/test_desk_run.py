@@ -20,19 +20,19 @@ def bench(finished_run):
 def test_whiskers_are_the_ellipticities_of_the_products(bench, finished_run):
     products = [read_product(path) for path in sorted(finished_run.glob("ccd_*.fits"))]
     columns = {
-        "observed": lambda p: p.observed.e1,
-        "model": lambda p: p.observed.model_e1,
-        "observed - model": lambda p: p.observed.residual_e1,
-        "noise-free": lambda p: p.holdout.e1,
-        "noise-free - model": lambda p: p.holdout.residual_e1,
+        "observed": lambda p: p.observed.g1,
+        "model": lambda p: p.observed.model_g1,
+        "observed - model": lambda p: p.observed.g1 - p.observed.model_g1,
+        "noise-free": lambda p: p.holdout.g1,
+        "noise-free - model": lambda p: p.holdout.g1 - p.holdout.model_g1,
     }
     for kind in KINDS:
         expected = np.concatenate([columns[kind](p) for p in products])
         view = run_whiskers(bench, replace(bench.start, kind=kind))
         np.testing.assert_array_equal(view.e1, expected[np.isfinite(expected)])
-        number = run_numbers(view, len(products))["ellipticity, rms"]
+        number = run_numbers(view, len(products))["adaptive ellipticity g, rms"]
         assert number == (pytest.approx(100 * np.sqrt(np.mean(view.e1**2 + view.e2**2))), "%")
-    x = np.concatenate([p.observed.x[np.isfinite(p.observed.e1)] for p in products])
+    x = np.concatenate([p.observed.x[np.isfinite(p.observed.g1)] for p in products])
     np.testing.assert_allclose(run_whiskers(bench, bench.start).x_mm, 1e3 * x)
 
 
@@ -40,7 +40,7 @@ def test_a_range_of_magnitudes_selects_the_observed_stars(bench):
     low, high = bench.start.magnitudes
     brighter = replace(bench.start, magnitudes=(low, 0.5 * (low + high)))
     magnitude = np.concatenate([s.observed.magnitude for s in bench.ccds.values()])
-    usable = np.isfinite(np.concatenate([s.observed.e1 for s in bench.ccds.values()]))
+    usable = np.isfinite(np.concatenate([s.observed.g1 for s in bench.ccds.values()]))
     count = np.count_nonzero(usable & (magnitude <= 0.5 * (low + high)))
     assert len(run_whiskers(bench, brighter).e1) == count
     with pytest.raises(DomainError, match=r"^0 stars are selected: expected 20 for a correlation$"):
@@ -51,10 +51,10 @@ def test_the_correlation_is_that_of_all_pairs_by_brute_force(bench):
     state = replace(bench.start, kind="noise-free")
     view = run_correlation(bench, state)
     stars = [s.holdout for s in bench.ccds.values()]
-    x, y, e1, e2 = (np.concatenate([getattr(s, n) for s in stars]) for n in ("field_x", "field_y", "e1", "e2"))
+    x, y, g1, g2 = (np.concatenate([getattr(s, n) for s in stars]) for n in ("field_x", "field_y", "g1", "g2"))
     first, second = np.triu_indices(len(x), 1)
     r = np.hypot(x[first] - x[second], y[first] - y[second]) / np.deg2rad(1 / 60)
-    product = e1[first] * e1[second] + e2[first] * e2[second]
+    product = g1[first] * g1[second] + g2[first] * g2[second]
     edges = np.geomspace(1 / 6, np.hypot(np.ptp(x), np.ptp(y)) / np.deg2rad(1 / 60), 13)
     counts, _ = np.histogram(r, edges)
     fullest = int(counts.argmax())

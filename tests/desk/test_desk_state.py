@@ -14,7 +14,7 @@ from pachon.core.errors import ConfigError, DomainError, PachonError, UnknownNam
 from pachon.desk.bench import Bench
 from pachon.desk.python_text import python_text
 from pachon.desk.state import DeskState, History, is_state_file
-from pachon.desk.views import FWHM, Scene, WhiskersView, numbers, opd_view, section_view, spots_view, whiskers_view
+from pachon.desk.views import Scene, WhiskersView, numbers, opd_view, section_view, spots_view, whiskers_view
 from pachon.models import OpticsState
 from pachon.wavefront.psf.stamps import Stamps
 
@@ -51,6 +51,8 @@ def test_a_state_is_the_same_after_saving_and_loading(tmp_path):
         ("desk: 1\nmodel: hsc\nseeing_arcsec: 99\n", "from 0 to 10"),
         ("desk: 1\n", "expected the name of a telescope"),
         ("desk: [1\n", "expected YAML"),
+        ("desk: 1\nmodel: 2026-13-45\n", "expected YAML.*month must be in 1..12"),
+        ("desk: 1\nmodel: hsc\nmodel: hsc\n", "expected YAML.*occurs twice"),
     ],
 )
 def test_what_is_no_state_is_one_line(text, message):
@@ -128,7 +130,9 @@ def test_whiskers_are_the_moments_of_the_stars_on_their_ccds():
         stamps=Stamps.of_camera("lsst", size=27),
     )
     np.testing.assert_allclose(view.e1, moments.g1, atol=1e-12)
-    np.testing.assert_allclose(view.fwhm_arcsec, np.rad2deg(moments.sigma) * 3600 * FWHM, rtol=1e-12)
+    np.testing.assert_allclose(
+        view.fwhm_arcsec, np.rad2deg(moments.sigma) * 3600 * 2.0 * np.sqrt(2.0 * np.log(2.0)), rtol=1e-12
+    )
     # Moments of the rays and of a Gaussian seeing: the same pattern, but for weights.
     far = replace(BENCH.start, optics={"M2_dz": 400.0})
     assert "rays" in whiskers_view(Scene.of(BENCH, far)).method
