@@ -31,7 +31,7 @@ def page_names(session: PageSession, *, live: bool) -> dict[str, Any]:
         "title": session.title,
         "subtitle": session.subtitle,
         "picture_names": names,
-        "wide_names": ["stamps"],
+        "wide_names": ["stamps", "components"],
         "root_names": ["sidebar"] if live else [],
         "state_text": "" if live else session.state_words,
     }
