@@ -153,11 +153,11 @@ class SweepSession(PageSession):
     def show_slice(self, low: float, high: float) -> None:
         """Select the points of a slice; one without points is one line, and the last selection stays."""
         rows = self.bench.in_slice(self.slice_select.value, low, high)
-        if not len(rows):
+        if not rows:
             status_text(self.status, f"{self.slice_select.value} from {low:g} to {high:g}: no point has such a value")
             return
         status_text(self.status, "")
-        self.source.selected.indices = rows.tolist()
+        self.source.selected.indices = rows
 
     def _select(self, indices: list[int]) -> None:
         if len(indices) == 1:

@@ -73,10 +73,11 @@ class PointsBench(ABC):
     def tornado(self, metric: str) -> TornadoView:
         """Return the effects of the parameters on a metric."""
 
-    def in_slice(self, parameter: str, low: float, high: float) -> np.ndarray:
+    def in_slice(self, parameter: str, low: float, high: float) -> list[int]:
         """Return the rows of the points whose parameter is within a range, both ends included."""
         values = self.parameters[parameter]
-        return np.flatnonzero((values >= low) & (values <= high))
+        rows: list[int] = np.flatnonzero((values >= low) & (values <= high)).tolist()
+        return rows
 
     def numbers(self, metric: str, selected: Sequence[int]) -> dict[str, tuple[float, str]]:
         """Return the number of selected points, all where there are none, and the range of the metric."""
