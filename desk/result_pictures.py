@@ -87,6 +87,9 @@ class PlacesPicture(Picture):
         self.mapper = LinearColorMapper(palette=Cividis256, low=0.0, high=1.0, nan_color=GREY)
         self.source = ColumnDataSource({"x": [], "y": [], "value": []})
         self._chosen = ColumnDataSource({"x": [], "y": []})
+        for axis in (self.figure.x_range, self.figure.y_range):
+            # Marks at the rim are whole.
+            axis.range_padding = 0.2
         color: Any = {"field": "value", "transform": self.mapper}
         style = {"source": self.source, "marker": "square", "size": size, "line_color": GREY}
         marks = self.figure.scatter("x", "y", fill_color=color, nonselection_fill_alpha=1.0, **style)

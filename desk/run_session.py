@@ -44,7 +44,7 @@ class RunSession(PageSession):
         self.whiskers.figure.on_event(SelectionGeometry, lambda event: self._brush(event.geometry))
         self.region = BoxAnnotation(fill_alpha=0.0, line_color=ORANGE, line_width=2, visible=False)
         self.whiskers.figure.add_layout(self.region)
-        self.xi = CorrelationPicture("Correlation of the selection, adaptive g")
+        self.xi = CorrelationPicture("Correlation of adaptive g")
         self.stamps = RowsPicture("stamps", "Stars of the CCD")
         self.components = RowsPicture("components", "PSF model of the CCD")
         self.pictures = (self.whiskers, self.xi, self.stamps, self.components)

@@ -87,7 +87,7 @@ class StackSession(PageSession):
         figure.xaxis.axis_label, figure.yaxis.axis_label = "x of the stack [arcmin]", "y of the stack [arcmin]"
         [hover] = figure.select({"type": HoverTool})
         hover.tooltips = [("x, y [arcmin]", "@x{0.00}, @y{0.00}"), ("g", "@e{0.00} %"), ("FWHM", "@fwhm{0.000} arcsec")]
-        self.xi = CorrelationPicture("Correlation of the points, adaptive g")
+        self.xi = CorrelationPicture("Correlation of adaptive g")
         self.pictures = (self.whiskers, self.xi)
         self.stack = Select(title="Visits in the stack", value=self.visits, options=list(bench.stacks))
         self.kinds = Select(title="Shapes", value=self.kind, options=list(STACK_KINDS))
