@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError, PachonError
+from ..design.tolerancing.monte_carlo import MonteCarlo
 from ..models.telescope import Telescope
+from ..sensing.result import DonutFit
 
 if TYPE_CHECKING:
     from bokeh.document import Document
@@ -99,21 +101,23 @@ class Desk:
 
 
 @check_arguments
-def open_desk(source: str | os.PathLike[str] | Telescope = "lsst_v3.3_r") -> Desk:
-    """Open the live views of a telescope, run or sweep.
+def open_desk(source: str | os.PathLike[str] | Telescope | MonteCarlo | DonutFit = "lsst_v3.3_r") -> Desk:
+    """Open the live views of a telescope, or of what was computed.
 
     Parameters
     ----------
-    source : str, path or Telescope
-        Bundled telescope, its file, a state that a desk saved, the folder of a run, the store of a sweep, or a
-        telescope. States of the latter name its file ``NAME.yaml``, which :func:`~pachon.save_telescope` writes.
+    source : str, path, Telescope, MonteCarlo or DonutFit
+        Bundled telescope, its file, a state that a desk saved, the folder of a run, of visits or of tolerances, the
+        store of a sweep, a table of donuts, a telescope, or a result of :func:`~pachon.monte_carlo`,
+        :func:`~pachon.run_tolerances` or :func:`~pachon.fit_donuts`. States of a telescope name its file
+        ``NAME.yaml``, which :func:`~pachon.save_telescope` writes.
 
     Raises
     ------
     ConfigError
         If Bokeh is missing, or the file of a state is wrong.
     DomainError, ProductError, UnknownNameError
-        If the source is no telescope, state, run or sweep.
+        If the source is nothing of these.
 
     Examples
     --------
@@ -124,18 +128,26 @@ def open_desk(source: str | os.PathLike[str] | Telescope = "lsst_v3.3_r") -> Des
     except ImportError:
         raise ConfigError("pachon desk needs Bokeh: pip install 'pachon[desk]'") from None
     from .bench import Bench
-    from .run_session import RunSession
-    from .run_views import RunBench
+    from .donut_views import is_table
+    from .result_pages import folder_page, result_page, table_page
     from .session import Session
     from .state import is_state_file
     from .sweep_views import SweepBench, is_store
+    from .tolerance_views import is_tolerance_folder
 
-    if not isinstance(source, Telescope) and Path(source).is_dir():
-        run = RunBench(Path(source))
-        return Desk(run.folder.resolve().name, lambda document: RunSession(run, document))
-    if not isinstance(source, Telescope) and is_store(Path(source)):
-        sweep = SweepBench(Path(source))
-        return Desk(sweep.table.name, lambda document: _sweep_session(sweep, document))
+    if isinstance(source, MonteCarlo | DonutFit):
+        return Desk(*result_page(source))
+    if not isinstance(source, Telescope):
+        path = Path(source)
+        if path.is_dir():
+            return Desk(*folder_page(path))
+        if is_store(path):
+            if is_tolerance_folder(path.parent):
+                return Desk(*folder_page(path.parent))
+            sweep = SweepBench(path)
+            return Desk(sweep.name, lambda document: _sweep_session(sweep, document))
+        if is_table(path):
+            return Desk(*table_page(path))
     if isinstance(source, Telescope) or not is_state_file(Path(source)):
         bench = Bench(source if isinstance(source, Telescope) else os.fspath(source))
         state = bench.start

@@ -32,7 +32,7 @@ def page_names(session: PageSession, *, live: bool) -> dict[str, Any]:
         "subtitle": session.subtitle,
         "picture_names": names,
         "hidden_names": [str(picture.figure.name) for picture in session.pictures if not picture.figure.visible],
-        "wide_names": ["stamps"],
+        "wide_names": ["stamps", "components"],
         "root_names": ["sidebar"] if live else [],
         "state_text": "" if live else session.state_words,
     }

@@ -6,17 +6,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from bokeh.document import Document
-from bokeh.events import Tap
+from bokeh.events import SelectionGeometry, Tap
 from bokeh.layouts import column
-from bokeh.models import ColumnDataSource, FixedTicker, RangeSlider, Select, Span, Whisker
+from bokeh.models import BoxAnnotation, Button, RangeSlider, Select
+from bokeh.models.tools import BoxSelectTool
 
 from ..core.errors import PachonError
-from ..measure.correlation import Correlation
 from .page_session import PageSession
-from .pictures import BLUE, ORANGE, MapPicture, Picture, WhiskersPicture, diverging_palette
-from .run_views import KINDS, RunBench, RunState, StampsView
+from .pictures import ORANGE, Picture, WhiskersPicture
+from .result_pictures import CorrelationPicture, RowsPicture
+from .run_views import RunBench, RunState
+from .run_views import run_components as components_of
 from .run_views import run_correlation as correlation_of
 from .run_views import run_numbers as numbers_of
 from .run_views import run_stamps as stamps_of
@@ -25,49 +26,6 @@ from .widgets import number_boxes, status_text
 
 #: Half of the side of a CCD, about [mm].
 _CCD = 22.0
-
-
-class StampsPicture(MapPicture):
-    """Stamps of stars, the model at each and the difference, row by row."""
-
-    def __init__(self) -> None:
-        axes = ("x [arcsec]", "")
-        super().__init__("stamps", "Stars of the CCD", axes, "part of the model's peak", diverging_palette())
-
-    def show(self, view: StampsView, ccd: str) -> None:
-        """Draw the stamps of a CCD."""
-        self.mapper.update(low=-1.0, high=1.0)
-        width, height = view.stars * view.side_arcsec, 3 * view.side_arcsec
-        image = np.sign(view.image) * np.sqrt(np.abs(view.image))
-        self.source.data = {"image": [np.float32(image)], "x": [0.0], "y": [0.0], "w": [width], "h": [height]}
-        self.bar.title = "signed sqrt(image / peak)"
-        self.figure.title.text = f"{ccd}: the first {view.stars} stars of the selection"
-        places = [(row + 0.5) * view.side_arcsec for row in range(3)]
-        axis = self.figure.yaxis[0]
-        axis.ticker = FixedTicker(ticks=places)
-        axis.major_label_overrides = dict(zip(places, ("star - model", "model", "star"), strict=True))
-
-
-class CorrelationPicture(Picture):
-    """The correlation function of the selection."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            "xi", "Correlation of the selection, adaptive g", "separation [arcmin]", "xi+", square=False, log_x=True
-        )
-        self.source = ColumnDataSource({"r": [], "xi": [], "low": [], "high": []})
-        self.figure.line("r", "xi", source=self.source, color=BLUE, line_width=1.5)
-        self.figure.scatter("r", "xi", source=self.source, color=BLUE, size=7)
-        bars = Whisker(source=self.source, base="r", lower="low", upper="high", line_color=BLUE)
-        for head in (bars.upper_head, bars.lower_head):
-            head.line_color = BLUE
-        self.figure.add_layout(bars)
-        self.figure.add_layout(Span(location=0.0, dimension="width", line_color=ORANGE, line_dash="dashed"))
-
-    def show(self, view: Correlation) -> None:
-        """Draw points with their errors."""
-        low, high = view.xi_plus - view.error_plus, view.xi_plus + view.error_plus
-        self.source.data = {"r": view.r_arcmin, "xi": view.xi_plus, "low": low, "high": high}
 
 
 class RunSession(PageSession):
@@ -81,8 +39,15 @@ class RunSession(PageSession):
         self.whiskers = WhiskersPicture(extent, 0.02 * extent, heights=False, center_mm=(x, y))
         self.whiskers.background = "ellipticity"
         self.whiskers.figure.on_event(Tap, lambda event: self._tap(event.x, event.y))
-        self.stamps, self.xi = StampsPicture(), CorrelationPicture()
-        self.pictures = (self.whiskers, self.xi, self.stamps)
+        select = BoxSelectTool(renderers=[])
+        self.whiskers.figure.add_tools(select)
+        self.whiskers.figure.on_event(SelectionGeometry, lambda event: self._brush(event.geometry))
+        self.region = BoxAnnotation(fill_alpha=0.0, line_color=ORANGE, line_width=2, visible=False)
+        self.whiskers.figure.add_layout(self.region)
+        self.xi = CorrelationPicture("Correlation of adaptive g")
+        self.stamps = RowsPicture("stamps", "Stars of the CCD")
+        self.components = RowsPicture("components", "PSF model of the CCD")
+        self.pictures = (self.whiskers, self.xi, self.stamps, self.components)
         self._make_widgets()
         self.paint("light")
         self.redraw()
@@ -90,24 +55,53 @@ class RunSession(PageSession):
     @property
     def state_words(self) -> str:
         """The selection in words."""
-        low, high = self.state.magnitudes
-        return (
-            f"{self.bench.folder.resolve().name}: {self.state.kind}, CCD {self.state.ccd}, magnitudes {low} to {high}"
-        )
+        ranges = {"magnitudes": self.state.magnitudes, "x [mm]": self.state.x_mm, "y [mm]": self.state.y_mm}
+        words = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in ranges.items())
+        return f"{self.bench.folder.resolve().name}: {self.state.kind}, CCD {self.state.ccd}, {words}"
 
     def _make_widgets(self) -> None:
-        low, high = self.state.magnitudes
-        self.kind = Select(title="Shapes", value=self.state.kind, options=list(KINDS))
+        self.kind = Select(title="Shapes", value=self.state.kind, options=list(self.bench.kinds))
         self.kind.on_change("value", lambda attribute, old, new: self.change(kind=new))
         self.ccd = Select(title="CCD of the stamps; or click one", value=self.state.ccd, options=list(self.bench.ccds))
         self.ccd.on_change("value", lambda attribute, old, new: self.change(ccd=new))
-        self.magnitudes = RangeSlider(title="Magnitudes of observed stars [AB]", start=low, end=high, step=0.1)
-        self.magnitudes.value = (low, high)
-        self.magnitudes.on_change("value_throttled", lambda attribute, old, new: self.change(magnitudes=tuple(new)))
-        for widget in (self.kind, self.ccd, self.magnitudes):
+        self.ranges = {
+            "magnitudes": self._range("magnitudes", "Magnitudes of observed stars [AB]", 0.1),
+            "x_mm": self._range("x_mm", "Detector x [mm]; or select a box", 1.0),
+            "y_mm": self._range("y_mm", "Detector y [mm]", 1.0),
+        }
+        whole = Button(label="Select all stars")
+        whole.on_click(lambda: self.show_state(replace(self.bench.start, kind=self.state.kind, ccd=self.state.ccd)))
+        parts = [self.kind, self.ccd, *self.ranges.values(), whole]
+        for widget in parts:
             widget.sizing_mode = "stretch_width"
-        parts = [self.kind, self.ccd, self.magnitudes, self.theme_toggle]
-        self.sidebar = column(*parts, name="sidebar", sizing_mode="stretch_width")
+        self.sidebar = column(*parts, self.theme_toggle, name="sidebar", sizing_mode="stretch_width")
+
+    def _range(self, name: str, title: str, step: float) -> RangeSlider:
+        low, high = getattr(self.state, name)
+        slider = RangeSlider(title=title, start=low, end=high, step=step, value=(low, high))
+        slider.on_change("value_throttled", lambda attribute, old, new: self.change(**{name: tuple(new)}))
+        return slider
+
+    def show_state(self, state: RunState) -> None:
+        """Set the widgets to a selection, and draw it."""
+        self.change(**{name: getattr(state, name) for name in ("kind", "ccd", *self.ranges)})
+
+    def _set_widgets(self) -> None:
+        self.kind.value, self.ccd.value = self.state.kind, self.state.ccd
+        for name, slider in self.ranges.items():
+            slider.value = getattr(self.state, name)
+
+    def _brush(self, geometry: Any) -> None:
+        """Select the stars in a box that was drawn; one that leaves the field is cut at its rim."""
+        if geometry.get("type") != "rect":
+            return
+        box = {}
+        for axis in "xy":
+            low, high = getattr(self.bench.start, f"{axis}_mm")
+            ends = (min(max(geometry[f"{axis}{end}"], low), high) for end in (0, 1))
+            box[f"{axis}_mm"] = tuple(sorted(ends))
+        middle = (0.5 * sum(box["x_mm"]), 0.5 * sum(box["y_mm"]))
+        self.change(**box, ccd=self.bench.nearest_ccd(*middle))
 
     def change(self, **values: Any) -> None:
         """Change the selection; one that is impossible is one line, and the last good one stays."""
@@ -117,26 +111,39 @@ class RunSession(PageSession):
         before, self.state = self.state, state
         if not self.redraw():
             self.state = before
-            self.kind.value, self.ccd.value = before.kind, before.ccd
+        self._set_widgets()
 
     def _tap(self, x: float | None, y: float | None) -> None:
         if x is not None and y is not None:
             self.ccd.value = self.bench.nearest_ccd(x, y)
 
     def redraw(self) -> bool:
-        """Draw the selection, and return whether all of it could be drawn."""
-        views: list[tuple[Callable[[RunBench, RunState], Any], Callable[[Any], None]]] = [
-            (whiskers_of, lambda view: self.whiskers.show(view, None, None)),
-            (correlation_of, self.xi.show),
-            (stamps_of, lambda view: self.stamps.show(view, self.state.ccd)),
-        ]
+        """Draw the selection, and return whether it has stars; a picture that it has too few for is empty."""
         try:
-            made = [make(self.bench, self.state) for make, _ in views]
+            whiskers = whiskers_of(self.bench, self.state)
         except PachonError as error:
             status_text(self.status, error)
             return False
-        for view, (_, show) in zip(made, views, strict=True):
-            show(view)
-        status_text(self.status, "")
-        self.table.text = number_boxes(numbers_of(made[0], len(self.bench.ccds)), {})
+        if not len(whiskers.e1):
+            status_text(self.status, "no star is selected")
+            return False
+        self.whiskers.show(whiskers, None, None)
+        views: list[tuple[Callable[[RunBench, RunState], Any], Picture, Callable[[Any], None]]] = [
+            (correlation_of, self.xi, lambda view: self.xi.show(view.r_arcmin, view.xi_plus, view.error_plus)),
+            (stamps_of, self.stamps, self.stamps.show),
+            (components_of, self.components, self.components.show),
+        ]
+        message = ""
+        for make, picture, show in views:
+            try:
+                show(make(self.bench, self.state))
+                picture.figure.visible = True
+            except PachonError as error:
+                picture.figure.visible = False
+                message = message or str(error)
+        start, (left, right), (bottom, top) = self.bench.start, self.state.x_mm, self.state.y_mm
+        self.region.update(left=left, right=right, bottom=bottom, top=top)
+        self.region.visible = (self.state.x_mm, self.state.y_mm) != (start.x_mm, start.y_mm)
+        status_text(self.status, message)
+        self.table.text = number_boxes(numbers_of(whiskers, len(self.bench.ccds)), {})
         return True

@@ -11,13 +11,25 @@ from ..core.errors import DomainError, ProductError, unknown_name
 from ..core.statistics import FWHM_PER_RMS, finite_median, rms
 from ..core.units import ARCSEC
 from ..measure.correlation import Correlation, SeparationBins, shear_correlation
-from ..reconstruction.ccd_product import CcdStars, Stars, product_path, read_product
+from ..reconstruction.ccd_product import CcdStars, ObservedStars, Stars, product_path, read_product
+from .result_views import RowsView
 from .views import WhiskersView
 
-#: What is shown of the stars.
-KINDS = ("noise-free", "observed", "model", "observed - model", "noise-free - model")
+#: What is shown of the stars, and the model that is taken off, by the beginning of its columns.
+KINDS = {
+    "noise-free": "",
+    "observed": "",
+    "model": "",
+    "observed - model": "model_",
+    "observed - model without the star": "leave_one_out_",
+    "noise-free - model": "model_",
+}
+#: The same of runs with a model of the whole focal plane.
+CCD_KINDS = {"observed - model of the CCD alone": "ccd_", "noise-free - model of the CCD alone": "ccd_"}
 #: Stars whose stamps are shown at once; rows are star, model, star - model.
 _STAMPS = 6
+#: Components of a PSF model that are shown, the first.
+_COMPONENTS = 7
 #: Shortest separation and number of bins of a correlation [rad].
 _SHORTEST = 10.0 * ARCSEC
 _BINS = 12
@@ -27,20 +39,13 @@ _FEWEST = 20
 
 @dataclass(frozen=True)
 class RunState:
-    """What is selected of a run: kind of shapes, CCD of the stamps, and range of magnitudes of observed stars."""
+    """What is selected of a run."""
 
-    kind: str
-    ccd: str
-    magnitudes: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class StampsView:
-    """Stars of a CCD, the model there, and their difference."""
-
-    image: np.ndarray  #: parts of the brightest pixel of each star, rows star, model, difference from above
-    stars: int  #: columns
-    side_arcsec: float  #: side of a stamp [arcsec]
+    kind: str  #: of shapes
+    ccd: str  #: of the stamps
+    magnitudes: tuple[float, float]  #: range of observed stars
+    x_mm: tuple[float, float]  #: range of places on the detector
+    y_mm: tuple[float, float]
 
 
 class RunBench:
@@ -56,22 +61,30 @@ class RunBench:
             product = read_product(path, holdout_images=False)
             self.ccds[product.name] = product.ccd_stars
         self.centers_mm = 1e3 * np.array([stars.center for stars in self.ccds.values()])
+        #: Kinds of shapes, and the beginning of the columns of the model that is taken off.
+        self.kinds = KINDS | (CCD_KINDS if all(stars.has_focal_plane_model for stars in self.ccds.values()) else {})
 
     @property
     def start(self) -> RunState:
-        """The selection at the beginning: all observed stars less their models, and the first CCD."""
+        """The selection at the beginning: all observed stars, and the first CCD."""
         magnitudes = np.concatenate([stars.observed.magnitude for stars in self.ccds.values()])
         low, high = float(np.floor(np.nanmin(magnitudes))), float(np.ceil(np.nanmax(magnitudes)))
-        return RunState(KINDS[1], next(iter(self.ccds)), (low, high))
+        places = np.concatenate(
+            [1e3 * np.stack([s.x, s.y]) for c in self.ccds.values() for s in (c.observed, c.holdout)], axis=1
+        )
+        x_mm, y_mm = ((float(np.floor(axis.min())), float(np.ceil(axis.max()))) for axis in places)
+        return RunState("observed", next(iter(self.ccds)), (low, high), x_mm, y_mm)
 
     def check(self, state: RunState) -> RunState:
         """Return a selection as it is; PachonError where it is none of this run."""
-        if state.kind not in KINDS:
-            raise unknown_name("kind of shapes", state.kind, KINDS)
+        if state.kind not in self.kinds:
+            raise unknown_name("kind of shapes", state.kind, self.kinds)
         if state.ccd not in self.ccds:
             raise unknown_name("CCD of the run", state.ccd, self.ccds)
-        if not state.magnitudes[0] <= state.magnitudes[1]:
-            raise DomainError(f"magnitudes = {state.magnitudes}: expected two that rise")
+        for name in ("magnitudes", "x_mm", "y_mm"):
+            low, high = getattr(state, name)
+            if not low <= high:
+                raise DomainError(f"{name} = {(low, high)}: expected two that rise")
         return state
 
     def nearest_ccd(self, x_mm: float, y_mm: float) -> str:
@@ -79,14 +92,24 @@ class RunBench:
         return list(self.ccds)[int(np.argmin(np.hypot(*(self.centers_mm - (x_mm, y_mm)).T)))]
 
     def selected(self, state: RunState) -> tuple[list[Stars], np.ndarray]:
-        """Return the stars of a selection, CCD by CCD, and which of all of them are in it."""
+        """Return the stars of the kind of a selection, CCD by CCD, and which of all of them are in it."""
         self.check(state)
-        if "noise-free" in state.kind:
-            holdouts: list[Stars] = [stars.holdout for stars in self.ccds.values()]
-            return holdouts, np.ones(sum(map(len, holdouts)), dtype=bool)
-        observed = [stars.observed for stars in self.ccds.values()]
-        magnitude = np.concatenate([stars.magnitude for stars in observed])
-        return list(observed), (magnitude >= state.magnitudes[0]) & (magnitude <= state.magnitudes[1])
+        if state.kind.startswith("noise-free"):
+            stars: list[Stars] = [ccd.holdout for ccd in self.ccds.values()]
+        else:
+            stars = [ccd.observed for ccd in self.ccds.values()]
+        return stars, np.concatenate([_in_ranges(of_ccd, state) for of_ccd in stars])
+
+
+def _in_ranges(stars: Stars, state: RunState) -> np.ndarray:
+    """Return which stars are within the ranges of places and magnitudes; noise-free ones have no magnitude."""
+    inside = np.ones(len(stars), dtype=bool)
+    ranges = [(1e3 * stars.x, state.x_mm), (1e3 * stars.y, state.y_mm)]
+    if isinstance(stars, ObservedStars):
+        ranges.append((stars.magnitude, state.magnitudes))
+    for values, (low, high) in ranges:
+        inside &= (values >= low) & (values <= high)
+    return inside
 
 
 def _columns(bench: RunBench, state: RunState, *names: str) -> list[np.ndarray]:
@@ -98,12 +121,13 @@ def _columns(bench: RunBench, state: RunState, *names: str) -> list[np.ndarray]:
 
     columns = []
     for name in names:
+        subtracted = bench.kinds[state.kind]
         if name not in ("g1", "g2", "sigma"):
             columns.append(column(name))
         elif state.kind == "model":
             columns.append(column(f"model_{name}"))
         else:
-            columns.append(column(name) - (column(f"model_{name}") if "- model" in state.kind else 0.0))
+            columns.append(column(name) - (column(f"{subtracted}{name}") if subtracted else 0.0))
     return columns
 
 
@@ -127,7 +151,7 @@ def run_correlation(bench: RunBench, state: RunState) -> Correlation:
     return shear_correlation(x[good], y[good], g1[good], g2[good], bins=bins)
 
 
-def run_stamps(bench: RunBench, state: RunState) -> StampsView:
+def run_stamps(bench: RunBench, state: RunState) -> RowsView:
     """Return stamps of the brightest selected stars of the CCD, with the model at each."""
     bench.check(state)
     path = product_path(bench.folder, state.ccd)
@@ -135,12 +159,8 @@ def run_stamps(bench: RunBench, state: RunState) -> StampsView:
     product = read_product(path, holdout_images=noise_free)
     stars: Stars = product.holdout if noise_free else product.observed
     images = product.holdout_images if noise_free else product.observed_images
-    usable = np.isfinite(images).all(axis=(1, 2))
-    order = np.arange(len(stars))
-    if not noise_free:
-        magnitude = product.observed.magnitude
-        usable &= (magnitude >= state.magnitudes[0]) & (magnitude <= state.magnitudes[1])
-        order = np.argsort(magnitude, kind="stable")
+    usable = np.isfinite(images).all(axis=(1, 2)) & _in_ranges(stars, state)
+    order = np.arange(len(stars)) if noise_free else np.argsort(product.observed.magnitude, kind="stable")
     shown = order[usable[order]][:_STAMPS]
     if not len(shown):
         raise DomainError(f"CCD {state.ccd}: no star is selected")
@@ -150,8 +170,30 @@ def run_stamps(bench: RunBench, state: RunState) -> StampsView:
     # Each star over its own light within the stamp, and all over the peak of its model.
     star_row = star_row * (model_row.sum(axis=(1, 2)) / star_row.sum(axis=(1, 2)))[:, None, None]
     peak = model_row.max(axis=(1, 2))[:, None, None]
-    rows = [np.concatenate(list(row / peak), axis=1) for row in (star_row - model_row, model_row, star_row)]
-    return StampsView(np.concatenate(rows), len(shown), side * product.pixel_scale / ARCSEC)
+    rows = {
+        "star": star_row / peak,
+        "model": model_row / peak,
+        "star - model": (star_row - model_row) / peak,
+    }
+    title = f"{state.ccd}: the first {len(shown)} stars of the selection"
+    return RowsView(rows, side * product.pixel_scale / ARCSEC, title)
+
+
+def run_components(bench: RunBench, state: RunState) -> RowsView:
+    """Return mean and first components of the PSF model of the CCD, eigen-PSFs where the basis is that of the stars."""
+    bench.check(state)
+    product = read_product(product_path(bench.folder, state.ccd), holdout_images=False)
+    model = product.model
+    count = min(_COMPONENTS, model.n_components) if model.basis.kind.has_components else 0
+    images = np.stack([model.mean, *model.components[:count]])
+    row = images / np.abs(images).max(axis=(1, 2), keepdims=True)
+    title = f"{state.ccd}: mean of the PSF model"
+    if count:
+        explained = 100.0 * model.explained
+        title += (
+            f" and {count} of {model.n_components} components, {model.basis.name}: {explained:.1f} % of the variance"
+        )
+    return RowsView({"": row}, model.mean.shape[0] * product.pixel_scale / ARCSEC, title)
 
 
 def _middle(images: np.ndarray, side: int) -> np.ndarray:

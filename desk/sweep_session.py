@@ -1,4 +1,4 @@
-"""A session of a sweep: linked plots of its points, the effects of its parameters, and points that open."""
+"""A session of a sweep or of tolerances: linked plots of points, slices, effects of parameters, points that open."""
 
 from __future__ import annotations
 
@@ -7,18 +7,20 @@ from typing import Any
 import numpy as np
 from bokeh.document import Document
 from bokeh.layouts import column
-from bokeh.models import Button, ColumnDataSource, CustomJS, FixedTicker, HoverTool, Select, Span, Spinner
+from bokeh.models import Button, ColumnDataSource, CustomJS, FixedTicker, HoverTool, RangeSlider, Select, Span, Spinner
 from bokeh.models.tools import BoxSelectTool, TapTool
 from bokeh.transform import dodge
 
 from ..core.errors import PachonError
 from .page_session import PageSession
 from .pictures import BLUE, GREEN, GREY, ORANGE, Picture
-from .sweep_views import SweepBench, TornadoView
+from .sweep_views import PointsBench, SweepBench, TornadoView
 from .widgets import number_boxes, status_text
 
 #: Parameters with a plot of their own, at most.
 _MOST_PLOTS = 8
+#: Choice of no slice.
+_NO_SLICE = "any value of all"
 #: Opens a point in another tab, at the same address.
 _OPEN = """
 const address = new URL(location.href);
@@ -75,18 +77,18 @@ class TornadoPicture(Picture):
 
 
 class SweepSession(PageSession):
-    """The desk of a sweep on one page."""
+    """The desk of a sweep, or of telescopes drawn within tolerances, on one page."""
 
-    def __init__(self, bench: SweepBench, document: Document | None = None, message: str = "") -> None:
-        count = len(bench.table)
-        parts = f"{count} points, {len(bench.table.parameters)} parameters, {len(bench.metrics)} metrics"
-        super().__init__(f"{bench.table.name}: desk of a sweep", parts, document)
+    def __init__(self, bench: PointsBench, document: Document | None = None, message: str = "") -> None:
+        count = len(bench.number)
+        parts = f"{count} points, {len(bench.parameters)} parameters, {len(bench.metrics)} metrics"
+        super().__init__(f"{bench.name}: desk of {bench.what}", parts, document)
         self.bench = bench
         self.metric = next(iter(bench.metrics))
         self.other = list(bench.metrics)[min(1, len(bench.metrics) - 1)]
         names = list(bench.parameters)[:_MOST_PLOTS]
         columns = {f"x{i}": bench.parameters[name] for i, name in enumerate(names)}
-        self.source = ColumnDataSource({"number": bench.table.number, "metric": np.zeros(count), **columns})
+        self.source = ColumnDataSource({"number": bench.number, "metric": np.zeros(count), **columns})
         self.source.data["other"] = np.zeros(count)
         y = bench.label(self.metric)
         self.plots = [
@@ -103,7 +105,7 @@ class SweepSession(PageSession):
     @property
     def state_words(self) -> str:
         """What is shown, in words."""
-        return f"{self.bench.table.name}: {self.bench.label(self.metric)}"
+        return f"{self.bench.name}: {self.bench.label(self.metric)}"
 
     def _make_widgets(self) -> None:
         metrics = list(self.bench.metrics)
@@ -112,11 +114,18 @@ class SweepSession(PageSession):
         for select, name in ((self.metric_select, "metric"), (self.other_select, "other")):
             select.on_change("value", lambda attribute, old, new, name=name: self.change(name, new))
         self.source.selected.on_change("indices", lambda attribute, old, new: self._select(new))
-        first = int(self.bench.table.number[0])
+        first = int(self.bench.number[0])
         self.point = Spinner(title="Point; or click one", value=first, low=0, step=1)
         self.open = Button(label="Open this telescope")
         self.open.js_on_click(CustomJS(args={"number": self.point}, code=_OPEN))
-        parts: list[Any] = [self.metric_select, self.other_select, self.point, self.open]
+        parameters = list(self.bench.parameters)
+        self.slice_select = Select(title="Slice: points with", value=_NO_SLICE, options=[_NO_SLICE, *parameters])
+        self.slice_select.on_change("value", lambda attribute, old, new: self._choose_slice(new))
+        self.slice_range = RangeSlider(title="within", start=0.0, end=1.0, value=(0.0, 1.0), step=0.1, visible=False)
+        self.slice_range.on_change("value_throttled", lambda attribute, old, new: self.show_slice(*new))
+        parts: list[Any] = [self.metric_select, self.other_select, self.slice_select, self.slice_range]
+        if isinstance(self.bench, SweepBench):
+            parts += [self.point, self.open]
         for widget in parts:
             widget.sizing_mode = "stretch_width"
         self.sidebar = column(*parts, self.theme_toggle, name="sidebar", sizing_mode="stretch_width")
@@ -127,9 +136,32 @@ class SweepSession(PageSession):
             setattr(self, axis, metric)
             self.redraw()
 
+    def _choose_slice(self, parameter: str) -> None:
+        """Set the range of the slice to a third in the middle of the values of a parameter, or show all points."""
+        self.slice_range.visible = parameter in self.bench.parameters
+        if not self.slice_range.visible:
+            self.source.selected.indices = []
+            return
+        values = self.bench.parameters[parameter]
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        third = (high - low) / 3.0
+        label = self.bench.label(parameter)
+        self.slice_range.update(title=label, start=low, end=high, step=(high - low) / 100.0)
+        self.slice_range.value = (low + third, high - third)
+        self.show_slice(*self.slice_range.value)
+
+    def show_slice(self, low: float, high: float) -> None:
+        """Select the points of a slice; one without points is one line, and the last selection stays."""
+        rows = self.bench.in_slice(self.slice_select.value, low, high)
+        if not rows:
+            status_text(self.status, f"{self.slice_select.value} from {low:g} to {high:g}: no point has such a value")
+            return
+        status_text(self.status, "")
+        self.source.selected.indices = rows
+
     def _select(self, indices: list[int]) -> None:
         if len(indices) == 1:
-            self.point.value = int(self.bench.table.number[indices[0]])
+            self.point.value = int(self.bench.number[indices[0]])
         self._show_numbers()
 
     def _show_numbers(self) -> None:

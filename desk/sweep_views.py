@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -37,8 +39,62 @@ class TornadoView:
     axis: str  #: what is drawn, with its unit
 
 
-class SweepBench:
+class PointsBench(ABC):
+    """Points with parameters and metrics.
+
+    Parameters
+    ----------
+    name : str
+        Name of the study.
+    number : ndarray of int, shape [n]
+        Number of each point.
+    parameters, metrics : dict of str to ndarray, shape [n]
+        What varies, and what depends on it; NaN where there is none.
+    """
+
+    #: What the points are of, in titles.
+    what: ClassVar[str]
+
+    def __init__(
+        self, name: str, number: np.ndarray, parameters: dict[str, np.ndarray], metrics: dict[str, np.ndarray]
+    ) -> None:
+        self.name, self.number = name, number
+        self.parameters, self.metrics = parameters, metrics
+
+    @abstractmethod
+    def label(self, name: str) -> str:
+        """Return the name of a parameter or metric with its unit."""
+
+    @abstractmethod
+    def unit(self, metric: str) -> str:
+        """Return the unit of a metric."""
+
+    @abstractmethod
+    def tornado(self, metric: str) -> TornadoView:
+        """Return the effects of the parameters on a metric."""
+
+    def in_slice(self, parameter: str, low: float, high: float) -> list[int]:
+        """Return the rows of the points whose parameter is within a range, both ends included."""
+        values = self.parameters[parameter]
+        rows: list[int] = np.flatnonzero((values >= low) & (values <= high)).tolist()
+        return rows
+
+    def numbers(self, metric: str, selected: Sequence[int]) -> dict[str, tuple[float, str]]:
+        """Return the number of selected points, all where there are none, and the range of the metric."""
+        rows = list(selected) or list(range(len(self.number)))
+        values, unit = self.metrics[metric][rows], self.unit(metric)
+        values = values[np.isfinite(values)]
+        table = {"points selected" if selected else "points": (float(len(rows)), "")}
+        if len(values):
+            for name, reduce in (("least", np.min), ("median", np.median), ("largest", np.max)):
+                table[f"{metric}, {name}"] = (float(reduce(values)), unit)
+        return table
+
+
+class SweepBench(PointsBench):
     """The computed points of a sweep."""
+
+    what = "a sweep"
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -52,16 +108,17 @@ class SweepBench:
             self._points = {point.number: point for point in store.points()}
         if not len(self.table):
             raise ProductError("no point has been computed yet", file=path)
-        self.metrics = {name: values for name, values in self.table.metrics.items() if np.isfinite(values).any()}
-        if not self.metrics:
+        metrics = {name: values for name, values in self.table.metrics.items() if np.isfinite(values).any()}
+        if not metrics:
             raise ProductError("no metric: expected one point that could be computed", file=path)
-        #: Parameters that are numbers and vary; NaN at points without one.
-        self.parameters: dict[str, np.ndarray] = {}
+        # Those that are numbers and vary.
+        parameters: dict[str, np.ndarray] = {}
         for name, values in self.table.parameters.items():
             if all(v is None or (isinstance(v, int | float | np.number) and not isinstance(v, bool)) for v in values):
                 numbers = np.array([np.nan if v is None else float(v) for v in values])
                 if len(np.unique(numbers[np.isfinite(numbers)])) > 1:
-                    self.parameters[name] = numbers
+                    parameters[name] = numbers
+        super().__init__(self.table.name, self.table.number, parameters, metrics)
 
     def label(self, name: str) -> str:
         """Return the name of a parameter or metric with its unit."""
@@ -96,17 +153,6 @@ class SweepBench:
         unit = self.unit(metric)
         axis = f"change of {metric} from nominal" + (f" [{unit}]" if unit else "")
         return TornadoView(tuple(curve.parameter for curve in alone), low, high, ranges, axis)
-
-    def numbers(self, metric: str, selected: Sequence[int]) -> dict[str, tuple[float, str]]:
-        """Return the number of selected points, all where there are none, and the range of the metric."""
-        rows = list(selected) or list(range(len(self.table)))
-        values, unit = self.metrics[metric][rows], self.unit(metric)
-        values = values[np.isfinite(values)]
-        table = {"points selected" if selected else "points": (float(len(rows)), "")}
-        if len(values):
-            for name, reduce in (("least", np.min), ("median", np.median), ("largest", np.max)):
-                table[f"{metric}, {name}"] = (float(reduce(values)), unit)
-        return table
 
     def opened(self, number: int) -> tuple[Bench, DeskState]:
         """Return the telescope of a point and its state.

@@ -55,6 +55,8 @@ sphinx_gallery_conf = {
     "filename_pattern": r"/\d\d_",
     "within_subsection_order": "FileNameSortKey",
     "image_scrapers": ("pages.saved_pictures",),
+    # Desks are live in notebooks alone.
+    "ignore_repr_types": r"pachon\.desk",
     "show_signature": False,
     "write_computation_times": False,
 }

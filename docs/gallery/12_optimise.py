@@ -19,3 +19,7 @@ found.plot().savefig("optimum.png")
 
 # %%
 # The command: ``pachon optimize lsst_v3.3_r --variables Camera.dz,Camera.dx``.
+
+# %%
+# The telescope on the :doc:`desk <../howto/desk>`, live in the notebook of this page:
+pachon.open_desk(found.telescope)

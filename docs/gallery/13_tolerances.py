@@ -25,3 +25,7 @@ drawn.plot().savefig("tolerances.png")
 
 # %%
 # More: :doc:`perturbations and tolerances <../howto/perturbations>`.
+
+# %%
+# The drawn telescopes on the :doc:`desk <../howto/desk>`, live in the notebook of this page:
+pachon.open_desk(drawn)

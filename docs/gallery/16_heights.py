@@ -20,3 +20,7 @@ figure.savefig("heights.png")
 
 # %%
 # More: :doc:`the camera as built <../howto/camera>`.
+
+# %%
+# Heights by hand on the :doc:`desk <../howto/desk>`, live in the notebook of this page:
+pachon.open_desk("lsst_v3.3_r")

@@ -26,3 +26,7 @@ fit.plot().savefig("donuts.png")
 
 # %%
 # More: :doc:`donuts <../explanation/donuts>`.
+
+# %%
+# Image, model and Zernikes on the :doc:`desk <../howto/desk>`, live in the notebook of this page:
+pachon.open_desk(fit)

@@ -69,8 +69,8 @@ class VisitProduct:
         write_fits(path, hdus, stamp, cards)
 
     @classmethod
-    def read(cls, path: Path, stamp: Stamp) -> VisitProduct:
-        """Read the file of a visit; ProductError if it is damaged or of another night."""
+    def read(cls, path: Path, stamp: Stamp | None = None) -> VisitProduct:
+        """Read the file of a visit; ProductError if it is damaged and, with a stamp, if it is of another night."""
         hdus = read_fits(path, stamp)
         header = hdus[0].header
         tables = {hdu.name: {name: column(hdu, name) for name in hdu.columns.names} for hdu in hdus[1:] if hdu.name}

@@ -15,12 +15,15 @@ import matplotlib
 import pytest
 from public_names import public_names
 
+import pachon
 from pachon.core.stability import PROVISIONAL
 
 DOCS = Path(__file__).parents[2] / "docs"
 GALLERY = sorted((DOCS / "gallery").glob("[0-9]*.py"))
 #: Examples of more than a second; CI builds the pages, and so runs them, all the same.
 LONG = {"20_donuts"}
+#: Examples whose notebooks end with a desk: design, tolerances, focal plane, donuts, PSF model, visits.
+NOTEBOOKS = {"12_optimise", "13_tolerances", "16_heights", "20_donuts", "26_run", "27_visits"}
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +44,10 @@ def test_there_are_twenty_examples():
 )
 def test_examples_run_and_show_what_they_do(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    desks, open_desk = [], pachon.open_desk
+    if path.stem in NOTEBOOKS:
+        pytest.importorskip("bokeh", reason="a notebook needs Bokeh: pip install 'pachon[desk]'")
+    monkeypatch.setattr(pachon, "open_desk", lambda source: desks.append(open_desk(source)))
     with matplotlib.rc_context(), contextlib.redirect_stdout(io.StringIO()) as printed:
         runpy.run_path(str(path))
     assert printed.getvalue().strip()
@@ -48,6 +55,8 @@ def test_examples_run_and_show_what_they_do(path, tmp_path, monkeypatch):
     pictures = [*tmp_path.glob("*.png")]
     assert pictures
     assert all(picture.read_bytes().startswith(b"\x89PNG") for picture in pictures)
+    assert [desk.document().get_model_by_name("numbers").text != "" for desk in desks] == [True] * len(desks)
+    assert len(desks) == (path.stem in NOTEBOOKS)
     # An example is short, and its page has a title and says what it teaches before the code.
     text = path.read_text(encoding="utf-8")
     _, introduction, program = text.split('"""\n', 2)[:3]

@@ -18,8 +18,10 @@ BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "
 if BROWSER is None:
     pytest.skip("the desk in a browser needs Chromium: apt install chromium", allow_module_level=True)
 
+from test_desk_results import donut_table, night_folder, stack_folder, tolerance_folder  # noqa: E402
 from test_desk_sweep import store_of  # noqa: E402
 
+import pachon  # noqa: E402
 from pachon.desk.bench import Bench  # noqa: E402
 from pachon.desk.run_views import KINDS, RunBench, run_numbers, run_whiskers  # noqa: E402
 from pachon.desk.sweep_views import SweepBench  # noqa: E402
@@ -202,7 +204,7 @@ def test_the_desk_of_a_run_draws_its_stars_and_a_clicked_ccd(finished_run, brows
         page.goto(url)
         page.wait_for_function(f"({TEXT})().includes('ellipticity')", timeout=PATIENCE)
         bench = RunBench(finished_run)
-        for kind in KINDS[::-1]:
+        for kind in list(KINDS)[::-1]:
             page.locator("select").first.select_option(kind)
             table = run_numbers(run_whiskers(bench, replace(bench.start, kind=kind)), len(bench.ccds))
             wait_for(page, {name: f"{value:.4g}" for name, (value, _) in table.items()})
@@ -215,6 +217,29 @@ def test_the_desk_of_a_run_draws_its_stars_and_a_clicked_ccd(finished_run, brows
         page.close()
     assert problems == []
     assert hosts - {None} == {"127.0.0.1"}
+
+
+def test_pages_of_results_draw_without_errors(browser, tmp_path):
+    sources = {
+        tolerance_folder(tmp_path / "tolerance"): 5,
+        donut_table(tmp_path / "donuts.ecsv"): 2,
+        night_folder(tmp_path / "night"): 2,
+        stack_folder(tmp_path / "stacks"): 2,
+    }
+    page, problems, requests = browser.new_page(viewport={"width": 700, "height": 900}), [], []
+    page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("request", lambda request: requests.append(request.url))
+    for source, pictures in sources.items():
+        target = tmp_path / "desk.html"
+        pachon.open_desk(source).export(target)
+        page.goto(target.as_uri())
+        count = "n => document.querySelectorAll('.bk-Figure').length == n"
+        page.wait_for_function(count, arg=pictures, timeout=PATIENCE)
+        assert page.evaluate("() => document.documentElement.scrollWidth") <= 700, source
+    assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert problems == []
+    page.close()
 
 
 @contextmanager

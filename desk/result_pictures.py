@@ -1,0 +1,122 @@
+"""Pictures that pages of results share: rows of images, correlations, numbers at places, bars with errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from bokeh.models import ColumnDataSource, FixedTicker, HoverTool, LinearColorMapper, Span, TapTool, Whisker
+from bokeh.palettes import Cividis256
+
+from .pictures import BLUE, GREY, ORANGE, MapPicture, Picture, diverging_palette
+from .result_views import ErrorBarsView, PlacesView, RowsView
+
+
+class RowsPicture(MapPicture):
+    """Rows of images, on a signed square-root scale."""
+
+    def __init__(self, name: str, title: str, unit: str = "arcsec") -> None:
+        super().__init__(name, title, (f"x [{unit}]", ""), "signed sqrt(image / peak)", diverging_palette())
+        self.mapper.update(low=-1.0, high=1.0)
+
+    def show(self, view: RowsView) -> None:
+        """Draw the rows, the first at the top."""
+        image, side = view.image, view.side_arcsec
+        stretched = np.float32(np.sign(image) * np.sqrt(np.abs(image)))
+        width, height = view.columns * side, len(view.rows) * side
+        self.source.data = {"image": [stretched], "x": [0.0], "y": [0.0], "w": [width], "h": [height]}
+        self.figure.title.text = view.title
+        places = [(row + 0.5) * side for row in range(len(view.rows))]
+        axis = self.figure.yaxis[0]
+        axis.ticker = FixedTicker(ticks=places)
+        axis.major_label_overrides = dict(zip(places, reversed(list(view.rows)), strict=True))
+
+
+class _WithErrors(Picture):
+    """A picture of numbers with standard errors."""
+
+    def _add_errors(self) -> None:
+        self.source = ColumnDataSource({"x": [], "y": [], "low": [], "high": []})
+        bars = Whisker(source=self.source, base="x", lower="low", upper="high", line_color=GREY)
+        for head in (bars.upper_head, bars.lower_head):
+            head.line_color = GREY
+        self.figure.add_layout(bars)
+        self.figure.add_layout(Span(location=0.0, dimension="width", line_color=ORANGE, line_dash="dashed"))
+
+    def _show(self, x: np.ndarray, y: np.ndarray, error: np.ndarray) -> None:
+        self.source.data = {"x": x, "y": y, "low": y - error, "high": y + error}
+
+
+class CorrelationPicture(_WithErrors):
+    """A correlation function xi+."""
+
+    def __init__(self, title: str) -> None:
+        super().__init__("xi", title, "separation [arcmin]", "xi+", square=False, log_x=True)
+        self._add_errors()
+        self.figure.line("x", "y", source=self.source, color=BLUE, line_width=1.5)
+        self.figure.scatter("x", "y", source=self.source, color=BLUE, size=7)
+
+    def show(self, r_arcmin: np.ndarray, xi_plus: np.ndarray, error: np.ndarray) -> None:
+        """Draw points with their standard errors."""
+        self._show(r_arcmin, xi_plus, error)
+
+
+class BarsPicture(_WithErrors):
+    """Bars with standard errors."""
+
+    def __init__(self, name: str, x_label: str, y_label: str) -> None:
+        super().__init__(name, "", x_label, y_label, square=False)
+        self._add_errors()
+        self.figure.vbar("x", 0.8, "y", source=self.source, color=BLUE)
+        self.figure.add_tools(HoverTool(tooltips=[(x_label, "@x"), (y_label, "@y"), ("from", "@low to @high")]))
+
+    def show(self, view: ErrorBarsView) -> None:
+        """Draw the bars."""
+        self.figure.title.text = view.title
+        self._show(view.x, view.value, view.error)
+
+
+class PlacesPicture(Picture):
+    """Numbers at places in colours; a click chooses a place, which is framed."""
+
+    def __init__(
+        self, name: str, labels: tuple[str, str], choose: Callable[[int], None], *, size: int = 18, square: bool = True
+    ) -> None:
+        super().__init__(name, "", *labels, square=square)
+        self.mapper = LinearColorMapper(palette=Cividis256, low=0.0, high=1.0, nan_color=GREY)
+        self.source = ColumnDataSource({"x": [], "y": [], "value": []})
+        self._chosen = ColumnDataSource({"x": [], "y": []})
+        for axis in (self.figure.x_range, self.figure.y_range):
+            # Marks at the rim are whole.
+            axis.range_padding = 0.2
+        color: Any = {"field": "value", "transform": self.mapper}
+        style = {"source": self.source, "marker": "square", "size": size, "line_color": GREY}
+        marks = self.figure.scatter("x", "y", fill_color=color, nonselection_fill_alpha=1.0, **style)
+        frame = {"fill_alpha": 0.0, "line_color": ORANGE, "line_width": 2.5, "marker": "square", "size": size + 6}
+        self.figure.scatter("x", "y", source=self._chosen, **frame)
+        self.bar = self.add_bar(self.mapper, "")
+        tips = [(labels[0], "@x{0.0000}"), (labels[1], "@y{0.0000}"), ("", "@value")]
+        self.figure.add_tools(HoverTool(renderers=[marks], tooltips=tips), TapTool(renderers=[marks]))
+
+        def chosen(attribute: str, old: list[int], new: list[int]) -> None:
+            if new:
+                choose(new[0])
+                self.source.selected.indices = []
+
+        self.source.selected.on_change("indices", chosen)
+
+    def show(self, view: PlacesView, chosen: int | None = None) -> None:
+        """Draw numbers at places; one of them may be framed."""
+        finite = view.value[np.isfinite(view.value)]
+        low, high = (float(v) for v in np.quantile(finite, [0.01, 0.99])) if len(finite) else (0.0, 1.0)
+        if view.diverging:
+            high = max(abs(low), abs(high))
+            low = -high
+        palette = diverging_palette() if view.diverging else Cividis256
+        self.mapper.update(palette=palette, low=low, high=high if high > low else low + 1e-6)
+        self.bar.title = view.label
+        self.figure.title.text = view.title
+        self.source.data = {"x": view.x, "y": view.y, "value": view.value}
+        framed = slice(0, 0) if chosen is None else slice(chosen, chosen + 1)
+        self._chosen.data = {"x": view.x[framed], "y": view.y[framed]}

@@ -1,0 +1,141 @@
+"""The telescopes drawn within tolerances, and views of them; nothing here draws."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import ProductError
+from ..core.files import parsing, read_bytes
+from ..core.table_files import read_columns
+from ..design.tolerancing.monte_carlo import MonteCarlo
+from ..studies.tolerance.result import ToleranceStudy
+from .sweep_views import PointsBench, TornadoView
+
+#: Files of the folder that ``pachon tolerance`` writes.
+_DRAWS, _SENSITIVITY, _SUMMARY = "draws.ecsv", "sensitivity.ecsv", "summary.json"
+_COMPENSATOR = " (compensator)"
+
+
+class ToleranceBench(PointsBench):
+    """Drawn telescopes: the merit against each deviation, the costliest first, and the tolerances alone.
+
+    Parameters
+    ----------
+    name : str
+        Name of the telescope.
+    columns : dict of str to ndarray, shape [n]
+        Merit, deviations and compensators of the draws by their names.
+    units : dict of str to str
+        Their units.
+    ends : dict of str to (float, float)
+        Changes of the merit by each tolerance alone at minus and plus its size; without a sensitivity study, NaN and
+        the rms contribution.
+    """
+
+    what = "tolerances"
+
+    def __init__(
+        self,
+        name: str,
+        merit: str,
+        columns: dict[str, np.ndarray],
+        units: dict[str, str],
+        ends: dict[str, tuple[float, float]],
+        sizes: dict[str, str],
+        axis: str,
+    ) -> None:
+        compensators = [key for key in columns if key.endswith(_COMPENSATOR)]
+        costliest = sorted(ends, key=lambda key: -_size(ends[key]))
+        super().__init__(
+            name,
+            np.arange(len(columns[merit])),
+            {key: columns[key] for key in (*costliest, *compensators)},
+            {key: columns[key] for key in (merit, *compensators)},
+        )
+        self._units, self._ends, self._sizes, self._axis = units, ends, sizes, axis
+
+    @classmethod
+    def of(cls, drawn: MonteCarlo) -> ToleranceBench:
+        """Return the bench of a result."""
+        criterion = drawn.criterion
+        scale, merit = criterion.scale, criterion.name
+        columns = {merit: scale * drawn.merit}
+        units = {merit: criterion.unit}
+        for i, compensator in enumerate(drawn.compensators):
+            columns[compensator + _COMPENSATOR] = drawn.moves[:, i]
+            units[compensator + _COMPENSATOR] = drawn.compensator_units[i]
+        for i, tolerance in enumerate(drawn.tolerances):
+            columns[tolerance.name], units[tolerance.name] = drawn.deviations[:, i], drawn.units[i]
+        names = [tolerance.name for tolerance in drawn.tolerances]
+        if isinstance(drawn, ToleranceStudy):
+            pairs = scale * (np.stack([drawn.lower, drawn.upper], axis=-1) - drawn.nominal)
+            axis = f"change of {merit}, the tolerance alone"
+        else:
+            pairs = scale * np.stack([np.full(len(names), np.nan), drawn.contribution], axis=-1)
+            axis = f"rms contribution to {merit}"
+        ends = {key: (float(low), float(high)) for key, (low, high) in zip(names, pairs, strict=True)}
+        sizes = {t.name: _text(t.size, unit) for t, unit in zip(drawn.tolerances, drawn.units, strict=True)}
+        return cls(drawn.telescope, merit, columns, units, ends, sizes, _with_unit(axis, criterion.unit))
+
+    @classmethod
+    def read(cls, folder: Path) -> ToleranceBench:
+        """Read the folder that ``pachon tolerance`` wrote; ProductError where it is none, or not whole."""
+        draws, sensitivity = (read_columns(folder / name) for name in (_DRAWS, _SENSITIVITY))
+        path = folder / _SUMMARY
+        with parsing(path, "damaged or no summary of tolerances", ProductError):
+            summary: dict[str, Any] = json.loads(read_bytes(path, ProductError))
+            merit, unit, nominal = str(summary["merit"]), str(summary["unit"]), float(summary["nominal"])
+            name = str(summary["telescope"])
+            # The reader makes all names of columns small.
+            names = {str(key).lower(): str(key) for key in sensitivity["name"]}
+            names |= {f"{key}{_COMPENSATOR}".lower(): f"{key}{_COMPENSATOR}" for key in summary["compensators"]}
+            names["merit"] = merit
+            columns = {names[key]: np.asarray(values, dtype=float) for key, values in draws.items()}
+            units = {names[key]: str(getattr(values, "unit", None) or "") for key, values in draws.items()}
+            rows = [sensitivity[key] for key in ("name", "lower_end", "upper_end", "size", "unit")]
+            ends, sizes = {}, {}
+            for key, low, high, size, size_unit in zip(*rows, strict=True):
+                ends[str(key)] = (float(low) - nominal, float(high) - nominal)
+                sizes[str(key)] = _text(float(size), str(size_unit))
+        return cls(
+            name, merit, columns, units, ends, sizes, _with_unit(f"change of {merit}, the tolerance alone", unit)
+        )
+
+    def unit(self, metric: str) -> str:
+        """Return the unit of a number."""
+        unit = self._units[metric]
+        return "" if unit == "1" else unit
+
+    def label(self, name: str) -> str:
+        """Return the name of a number with its unit."""
+        return _with_unit(name, self.unit(name))
+
+    def tornado(self, metric: str) -> TornadoView:
+        """Return what each tolerance alone does to the merit, the costliest last; the same for all numbers."""
+        names = sorted(self._ends, key=lambda key: _size(self._ends[key]))
+        low, high = np.array([self._ends[key] for key in names]).reshape(-1, 2).T
+        return TornadoView(tuple(names), low, high, tuple(self._sizes[key] for key in names), self._axis)
+
+
+def is_tolerance_folder(folder: Path) -> bool:
+    """Return whether a folder has the tables of ``pachon tolerance``."""
+    return all((folder / name).is_file() for name in (_DRAWS, _SENSITIVITY))
+
+
+def _size(ends: Sequence[float]) -> float:
+    """Return the larger change; one that loses the light has none."""
+    finite = [abs(end) for end in ends if np.isfinite(end)]
+    return max(finite, default=0.0)
+
+
+def _with_unit(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit and unit != "1" else name
+
+
+def _text(size: float, unit: str) -> str:
+    return f"± {size:.4g}" + (f" {unit}" if unit and unit != "1" else "")
