@@ -92,8 +92,9 @@ def validated(
             return model.model_validate(content, context=context)
         except ValidationError as problems:
             # A misspelt key is the likelier cause of the other problems, so it goes first.
-            first = min(problems.errors(include_url=False), key=lambda p: p["type"] != "unknown_key")
-            first_error = _one_line_error(first, content, source, error)
+            errors = problems.errors(include_url=False)
+            first = min(errors, key=lambda p: p["type"] != "unknown_key")
+            first_error = _one_line_error(first, content, source, error, others=errors)
             if drop is None or first["type"] != "unknown_key":
                 raise first_error from None
             drop(first_error)
@@ -312,7 +313,23 @@ _EXPECTED = {
 _LIMITS = {"greater_than": ("gt", "above"), "greater_than_equal": ("ge", "from"), "less_than_equal": ("le", "up to")}
 
 
-def _one_line_error(problem: Mapping[str, Any], content: Any, source: str, error: type[PachonError]) -> PachonError:
+def _missing_key(problem: Mapping[str, Any], content: Any) -> str:
+    """Return the path of the key that is missing, or an empty text where the problem is another one."""
+    key = problem.get("ctx", {}).get("key") if problem["type"] == "expected" else None
+    if problem["type"] != "missing" and (not key or key in problem["input"]):
+        return ""
+    return _key_path([*problem["loc"], *filter(None, [key])], content)
+
+
+def _one_line_error(
+    problem: Mapping[str, Any],
+    content: Any,
+    source: str,
+    error: type[PachonError],
+    *,
+    others: Iterable[Mapping[str, Any]] = (),
+) -> PachonError:
+    """Return the error of a problem; one of a missing key names those that `others` miss too."""
     kind, value, limits = problem["type"], problem["input"], problem.get("ctx", {})
     path = _key_path([*problem["loc"], *filter(None, [limits.get("key")])], content)
     if kind == "unknown_key":
@@ -324,7 +341,9 @@ def _one_line_error(problem: Mapping[str, Any], content: Any, source: str, error
     if limits.get("key"):
         kind, value = ("expected", value[limits["key"]]) if limits["key"] in value else ("missing", None)
     if kind == "missing":
-        return error(f"{path} is missing", file=source, key=path)
+        also = [key for key in dict.fromkeys(_missing_key(p, content) for p in others) if key not in ("", path)]
+        also_text = ", ".join(also[:8] + ["..."] * (len(also) > 8))
+        return error(f"{path} is missing" + (f"; also {also_text}" if also else ""), file=source, key=path)
     if kind == "expected":
         text = limits["expected"]
     elif kind == "literal_error":

@@ -214,6 +214,8 @@ def test_missing_and_unreadable_files_are_one_line(tmp_path):
         ),
         ("radius: 19.835", "radius: .nan", "mine.yaml: surfaces[M1].radius = nan: expected a number"),
         ("radius: 19.835, ", "", "mine.yaml: surfaces[M1].radius is missing"),
+        ("name: lsst_v3.3_r\n", "", "mine.yaml: name is missing"),
+        ("stop: {z: 0.4393899}\npupil:", "#", "mine.yaml: stop is missing; also pupil"),
         (
             "shape: even_asphere",
             "shape: asphere",
