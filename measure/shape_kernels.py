@@ -198,7 +198,7 @@ def centre_weights(
 
 @wp.func
 def difference(before: wp.float64, here: wp.float64, after: wp.float64, place: wp.int32, last: wp.int32) -> wp.float64:
-    """Derivative along a line of pixels, one-sided at its ends."""
+    """Differentiate along a line of pixels, one-sided at its ends."""
     if place == 0:
         return after - here
     if place == last:

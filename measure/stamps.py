@@ -263,7 +263,7 @@ def _shift_matrices(count: int, shifts: np.ndarray, lines: slice) -> np.ndarray:
     sinc = np.sin(np.pi * part) * (2.0 * (steps % 2) - 1.0)
     sinc = np.divide(sinc, below, out=np.ones(turn.shape), where=np.abs(sine) >= 1e-12)
     # The pixel at `to` gets that at `of` times the periodic sinc of to - of less the shift.
-    around = (np.arange(1 - count, count) - whole.astype(int)[:, None]) % count
+    around = (np.arange(1 - count, count) - (whole % count).astype(int)[:, None]) % count
     line = sinc[np.arange(len(shifts))[:, None], around][:, count - 1 :]
     strides = (*line.strides, -line.strides[1])
     to_of = np.lib.stride_tricks.as_strided(line, (len(shifts), count, count), strides, writeable=False)
