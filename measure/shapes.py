@@ -13,16 +13,20 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
+from ..core.launch import launch
 from ..core.point_plots import draw_shapes
 from ..core.result import Result
 from ..core.threads import one_blas_thread
 from ..core.units import ARCSEC, positive_angle, pure_numbers, real_numbers, require_positive
+from ..core.warp_arrays import warp_array
 from .masked_moments import MaskedMoments, fill_by_moments
 from .pixel_masks import bad_pixels, weightless_pixels
+from .shape_kernels import LANES, MOMENTS, WEIGHT_ROWS, add_areas, centre_weights, packet
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -257,41 +261,31 @@ def _measure_batch(
     `starts` are where centroids are looked for first, [n, 2].
     """
     count, ny, nx = images.shape
-    half = np.array([(nx - 1) / 2.0, (ny - 1) / 2.0])
-    farthest = half - np.minimum(sigma, 0.5 * half)  # nearer to the edge, the weight would be cut
     flags = np.zeros(count, dtype=np.int32)
     with np.errstate(invalid="ignore"):  # infinities of both signs
         flux = images.reshape(count, -1).sum(axis=1)
     flags[~np.isfinite(flux)] |= ShapeFlag.NO_FLUX
-    center = np.zeros((count, 2)) if starts is None else starts.copy()
-    active = np.flatnonzero(flags == 0)
-    for _ in range(max_iterations):
-        if not len(active):
-            break
-        pixels = images if len(active) == count else images[active]
-        total, first, second = _weighted_moments(pixels, center[active], sigma)
-        dark = ~(total > 0.0)
-        flags[active[dark]] |= ShapeFlag.NO_FLUX
-        active, first, second = active[~dark], first[~dark], second[~dark]
-        step = _newton_step(first, second, sigma)
-        done = np.hypot(step[:, 0], step[:, 1]) < tolerance
-        center[active] += step
-        gone = np.any(np.abs(center[active]) > farthest, axis=1)
-        flags[active[gone]] |= ShapeFlag.CENTROID_LEFT_STAMP
-        active = active[~(done | gone)]
-    flags[active] |= ShapeFlag.NOT_CONVERGED
-    center[flags != 0] = np.nan
+    moments = np.zeros((count, MOMENTS))
+    if starts is not None:
+        moments[:, :2] = starts
+    pixels = np.zeros((count, ny, -(-nx // LANES) * LANES))
+    pixels[:, :, :nx] = images
+    pixels = pixels.reshape(count, ny, -1, LANES)
+    work_space = np.empty((count, WEIGHT_ROWS, *pixels.shape[2:]))
+    arrays = [warp_array(work_space, packet), warp_array(moments), warp_array(flags, wp.int32)]
+    options = [(nx - 1) / 2.0, (ny - 1) / 2.0, sigma, max_iterations, tolerance]
+    launch(centre_weights, count, [warp_array(pixels, packet), *options, *arrays], threads=1)
+    moments[flags != 0, :2] = np.nan
+    center = moments[:, :2]
     measured = np.flatnonzero(flags == 0)
-    # Once more about the final centre: the moments of the last pass belong to the centre before its step.
-    pixels = images if len(measured) == count else images[measured]
-    _, first, second = _weighted_moments(pixels, center[measured], sigma)
+    first, second = moments[measured, 2:4], moments[measured, 4:]
     q11 = second[:, 0] - first[:, 0] ** 2
     q22 = second[:, 1] - first[:, 1] ** 2
     q12 = second[:, 2] - first[:, 0] * first[:, 1]
     determinant = q11 * q22 - q12**2
     good = (determinant > 0.0) & (q11 > 0.0)
     flags[measured[~good]] |= ShapeFlag.NEGATIVE_MOMENTS
-    endless = (determinant > _WIDEST**4 * sigma**4) | _rises_to_an_edge(pixels, center[measured], sigma)
+    endless = (determinant > _WIDEST**4 * sigma**4) | _rises_to_an_edge(images, measured, center, sigma)
     flags[measured[endless & good]] |= ShapeFlag.NO_SOURCE
     good &= ~endless
     e1, e2, size = (np.full(count, np.nan) for _ in range(3))
@@ -322,72 +316,21 @@ def _measure_masked(
     return shapes
 
 
-def _rises_to_an_edge(images: np.ndarray, center: np.ndarray, sigma: float) -> np.ndarray:
-    """Return whether an edge within two rms widths of the weight is brighter than the mean under the weight, [n]."""
-    rises = np.zeros(len(images), dtype=bool)
+def _rises_to_an_edge(images: np.ndarray, measured: np.ndarray, centers: np.ndarray, sigma: float) -> np.ndarray:
+    """Return whether an edge within two rms widths of the weight is brighter than the mean under it, [n_measured]."""
+    rises, center = np.zeros(len(measured), dtype=bool), centers[measured]
     reach = 2.0 * sigma
     half = 0.5 * np.array([images.shape[2] - 1.0, images.shape[1] - 1.0])
     for i in np.flatnonzero((np.abs(center) > half - reach).any(axis=1)):
         offsets = [np.arange(2.0 * h + 1.0) - h - c for h, c in zip(half, center[i], strict=True)]
         weights = [np.exp(-0.5 * (offset / sigma) ** 2) for offset in offsets]
         weight_x, weight_y = (weight / weight.sum() for weight in weights)
-        columns, rows = weight_y @ images[i], images[i] @ weight_x
+        image = images[measured[i]]
+        columns, rows = weight_y @ image, image @ weight_x
         mean = columns @ weight_x
         for line, offset in ((columns, offsets[0]), (rows, offsets[1])):
             rises[i] |= any(abs(offset[end]) < reach and line[end] > mean for end in (0, -1))
     return rises
-
-
-def _weighted_moments(
-    images: np.ndarray, center: np.ndarray, sigma: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the sum [n], mean (x, y) [n, 2] and (xx, yy, xy) [n, 3] of weight times image about `center`.
-
-    Sums row by row and no matrix products: these add in an order that no batch size and no BLAS changes.
-    """
-    _, ny, nx = images.shape
-    x = np.arange(nx) - (nx - 1) / 2.0 - center[:, :1]
-    y = np.arange(ny) - (ny - 1) / 2.0 - center[:, 1:]
-    weight_x = np.exp(-0.5 * (x / sigma) ** 2)
-    weight_y = np.exp(-0.5 * (y / sigma) ** 2)
-    row0, row1, row2 = (
-        np.einsum("nyx,nx->ny", images, factor) * weight_y for factor in (weight_x, weight_x * x, weight_x * x**2)
-    )
-    total = row0.sum(axis=1)
-    sums = np.stack(
-        [row1.sum(axis=1), (row0 * y).sum(axis=1), row2.sum(axis=1), (row0 * y**2).sum(axis=1), (row1 * y).sum(axis=1)],
-        axis=1,
-    )
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # a stamp without light is flagged by its sum
-        means = sums / total[:, None]
-    return total, means[:, :2], means[:, 2:]
-
-
-def _newton_step(first: np.ndarray, second: np.ndarray, sigma: float) -> np.ndarray:
-    """Return the step that brings the weighted first moment to zero.
-
-    The derivative of sum(W I (x - c)) with respect to -c is sum(W I) (1 - M/sigma^2), M being the second moments
-    about c; for a Gaussian image that gives the exact centroid at once. Where the image is too broad or too noisy for
-    it (an eigenvalue under 0.1) that eigenvalue is raised to 0.1, and no step is longer than the weight is wide.
-    """
-    a = 1.0 - second[:, 0] / sigma**2
-    b = 1.0 - second[:, 1] / sigma**2
-    c = -second[:, 2] / sigma**2
-    mean, radius = 0.5 * (a + b), np.hypot(0.5 * (a - b), c)
-    low, high = np.maximum(mean - radius, 0.1), np.maximum(mean + radius, 0.1)
-    # The inverse of the matrix with eigenvalues (high, low), as (trace part) + (trace-free part along the old axes).
-    even, odd = 0.5 * (1.0 / high + 1.0 / low), 0.5 * (1.0 / high - 1.0 / low)
-    safe = np.where(radius > 0.0, radius, 1.0)
-    cos, sin = np.where(radius > 0.0, 0.5 * (a - b), 0.0) / safe, np.where(radius > 0.0, c, 0.0) / safe
-    step = np.stack(
-        [
-            (even + odd * cos) * first[:, 0] + odd * sin * first[:, 1],
-            odd * sin * first[:, 0] + (even - odd * cos) * first[:, 1],
-        ],
-        axis=1,
-    )
-    length = np.hypot(step[:, 0], step[:, 1])
-    return step * (sigma / np.maximum(length, sigma))[:, None]
 
 
 @lru_cache(maxsize=8)
@@ -444,31 +387,9 @@ def _interpolated_peaks(fine: np.ndarray) -> np.ndarray:
 
 def _areas_above(fine: np.ndarray, levels: np.ndarray) -> np.ndarray:
     """Return the areas of images above levels [n], in pixels; border pixels count in part, as if planes there."""
-    height = fine - levels[:, None, None]
-    inside = height > 0.0
-    # No slope is steeper than the largest differences: most pixels are neither border nor in need of a gradient.
-    steepest = [np.abs(np.diff(fine, axis=axis)).max(axis=(1, 2)) for axis in (1, 2)]
-    near = np.abs(height) <= 0.5 * np.hypot(*steepest)[:, None, None]
-    n, ny, nx = fine.shape
-    places = np.flatnonzero(near)
-    image, row, column = places // (ny * nx), places // nx % ny, places % nx
-    gy = _difference_along(fine, places, row, nx)
-    gx = _difference_along(fine, places, column, 1)
-    slope, height_there = np.hypot(gx, gy), height.ravel()[places]
-    border = np.abs(height_there) < 0.5 * slope
-    covered = 0.5 + height_there[border] / slope[border] - inside.ravel()[places[border]]
-    return np.asarray(inside.sum(axis=(1, 2)) + np.bincount(image[border], covered, n))
-
-
-def _difference_along(fine: np.ndarray, places: np.ndarray, along: np.ndarray, step: int) -> np.ndarray:
-    """Return the derivative of images along an axis at flat places, as :func:`numpy.gradient` has it.
-
-    `along` are their indices on that axis, and `step` is the distance of neighbours along it.
-    """
-    last = fine.shape[1 if step > 1 else 2] - 1
-    low, high = np.where(along > 0, 1, 0), np.where(along < last, 1, 0)
-    values = fine.ravel()
-    return np.asarray((values[places + step * high] - values[places - step * low]) / (low + high))
+    areas = np.empty(len(fine))
+    launch(add_areas, len(fine), [warp_array(fine), warp_array(levels), warp_array(areas)], threads=1)
+    return areas
 
 
 def stamp_cube(images: ArrayLike) -> np.ndarray:

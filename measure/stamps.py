@@ -253,18 +253,20 @@ def _shift_matrices(count: int, shifts: np.ndarray, lines: slice) -> np.ndarray:
 
     [n, n_lines, count]. The highest frequency of an even number of pixels stands for both its signs.
     """
-    whole = np.rint(shifts)[:, None]
-    part = shifts[:, None] - whole
-    # The pixel at `to` gets that at `of` times the periodic sinc of to - of less the shift.
-    steps = np.arange(1 - count, count) - whole
-    steps -= count * np.rint(steps / count)
+    whole = np.rint(shifts)
+    part = (shifts - whole)[:, None]
+    steps = np.arange(count)
+    steps[steps > count // 2] -= count
     turn = np.pi * (steps - part) / count
-    sign = 2.0 * (steps % 2) - 1.0
     sine = np.sin(turn)
-    on_pixel = np.abs(sine) < 1e-12
-    below = np.where(on_pixel, 1.0, sine if count % 2 else np.tan(turn))
-    sinc = np.where(on_pixel, 1.0, sign * np.sin(np.pi * part) / (count * below))
-    to_of = np.lib.stride_tricks.sliding_window_view(sinc[:, ::-1], count, axis=1)[:, ::-1]
+    below = count * (sine if count % 2 else np.tan(turn))
+    sinc = np.sin(np.pi * part) * (2.0 * (steps % 2) - 1.0)
+    sinc = np.divide(sinc, below, out=np.ones(turn.shape), where=np.abs(sine) >= 1e-12)
+    # The pixel at `to` gets that at `of` times the periodic sinc of to - of less the shift.
+    around = (np.arange(1 - count, count) - (whole % count).astype(int)[:, None]) % count
+    line = sinc[np.arange(len(shifts))[:, None], around][:, count - 1 :]
+    strides = (*line.strides, -line.strides[1])
+    to_of = np.lib.stride_tricks.as_strided(line, (len(shifts), count, count), strides, writeable=False)
     return np.ascontiguousarray(to_of[:, lines])
 
 

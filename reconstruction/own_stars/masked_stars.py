@@ -24,6 +24,8 @@ _CONVERGED = 1e-3
 _MOST_PASSES = 10
 # Passes with a new median star: later ones change it by less than its noise.
 _MEDIAN_PASSES = 2
+# Least part by which a step is expected to be shorter than the one before it: the rest is the masked part of the light.
+_LEAST_FALL = 0.2
 # Pixels beyond the stamp of the PSF on each side that shifts may bring in from the other side, or masks move.
 _ROOM = 8
 # Kernel (:data:`~.psf_model.covariance.COLUMNS`) of the pixels of stars, times what the stars show of it.
@@ -158,18 +160,28 @@ def fill_by_median_star(
             star = _median_star(images, bad, x, y, sigma)
         filled[masked] = fill_by_profiles(images[masked], bad[masked], star, x[masked], y[masked], sigma)[0]
     moving = masked
+    places_before, steps_before = np.full((2, len(images), 2), np.nan)
     for number in range(_MOST_PASSES):
         if not (usable.any() and len(moving)):
             break
         if number < _MEDIAN_PASSES:
             star, moving = _median_star(filled[usable], bad[usable], x[usable], y[usable], sigma), masked
-        filled[moving], lost[moving] = fill_by_profiles(images[moving], bad[moving], star, x[moving], y[moving], sigma)
-        near = np.stack([x[moving], y[moving]], axis=1)
-        shapes = measure_shapes(filled[moving], pixel_scale, weight_fwhm, centers=near)
-        step = np.hypot(shapes.x - x[moving], shapes.y - y[moving])
+        places = np.stack([x[moving], y[moving]], axis=1)
+        filled[moving], lost[moving] = fill_by_profiles(images[moving], bad[moving], star, *places.T, sigma)
+        shapes = measure_shapes(filled[moving], pixel_scale, weight_fwhm, centers=places, tolerance=0.1 * _CONVERGED)
         x[moving], y[moving] = shapes.x, shapes.y
         usable[moving] = shapes.usable & ~lost[moving]
-        moving = moving[usable[moving] & (step > _CONVERGED)]
+        steps = np.stack([shapes.x, shapes.y], axis=1) - places
+        going = usable[moving] & (np.hypot(*steps.T) > _CONVERGED)
+        moves, changes = places - places_before[moving], steps - steps_before[moving]
+        places_before[moving], steps_before[moving] = places, steps
+        moving, moves, changes, steps = moving[going], moves[going], changes[going], steps[going]
+        # The fill pulls the centroid to where it was: steps fall like a series, whose sum is where they lead.
+        squares = (moves**2).sum(axis=1)
+        falls = np.divide(-(moves * changes).sum(axis=1), squares, out=np.ones(len(moving)), where=squares > 0.0)
+        beyond = 1.0 / np.clip(falls, _LEAST_FALL, 1.0) - 1.0
+        x[moving] += beyond * steps[:, 0]
+        y[moving] += beyond * steps[:, 1]
     return FilledStars(filled, star, x, y, usable, lost)
 
 

@@ -214,7 +214,8 @@ def fit_own_stars(
         filled_stars = stars.filled.refilled(images, bad[inner], masked, psfs, scale, weight)
         # Bad pixels farther out than the width are no part of it.
         changed = masked[wide.usable[masked] & filled_stars.bad_within(bad[inner], masked, weight / scale)]
-        widths[changed] = fwhm(filled_stars.images[changed], scale)
+        if len(changed):
+            widths[changed] = fwhm(filled_stars.images[changed], scale)
         weight = finite_median(widths[wide.usable & ~filled_stars.lost])
         centred = stars.images.copy()
         centred[masked] = centre(filled_stars, masked)
