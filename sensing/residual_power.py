@@ -361,7 +361,7 @@ class StationaryField:
 def _gaussian(count: int, length: float) -> np.ndarray:
     """Return the Gaussian correlations of places on a line, of a length [pixels], shape [n, n]."""
     correlation = np.exp(-0.5 * (np.arange(count) / length) ** 2)
-    return toeplitz(np.where(correlation > _UNCORRELATED, correlation, 0.0))
+    return np.asarray(toeplitz(np.where(correlation > _UNCORRELATED, correlation, 0.0)))
 
 
 def _fields(linearized: Linearized, squares: _Squares, resolution: float) -> dict[str, Field]:
