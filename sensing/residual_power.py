@@ -29,7 +29,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from scipy.linalg import cho_factor, eigh, solve_triangular
+from scipy.linalg import cho_factor, eigh, solve_triangular, toeplitz
 from scipy.optimize import minimize, nnls
 
 from .likelihood import Linearized
@@ -189,19 +189,22 @@ class _Patterns:
         variances, vectors = eigh(np.diag(self.variances), np.eye(count) + power)
         energies = (vectors.T @ self.amplitudes) ** 2
 
-        def loss(sizes: np.ndarray) -> float:
-            total = np.exp(sizes[1]) + np.exp(2.0 * sizes[0]) * variances
-            return float(0.5 * (np.log(total) + energies / total).sum())
+        def loss(sizes: np.ndarray) -> tuple[float, np.ndarray]:
+            """Return the loss at logarithms of the rms of the field and of the variance of all, and its slopes."""
+            level, of_field = np.exp(sizes[1]), np.exp(2.0 * sizes[0]) * variances
+            total = level + of_field
+            slope = 0.5 * (1.0 - energies / total) / total
+            value = 0.5 * (np.log(total) + energies / total).sum()
+            return float(value), np.array([2.0 * slope @ of_field, slope.sum() * level])
 
         noise = math.log(max(float(energies.mean()), 1.0))
         none, searched = (_RMS_LIMITS[0], _RMS_LIMITS[0]), _RMS_LIMITS
-        fits = [(loss(np.array([none[0], 0.0])), 0.0, 0.0)]
+        fits = [(loss(np.array([none[0], 0.0]))[0], 0.0, 0.0)]
         for rms_limits, most in ((searched, 0.0), (none, noise), (searched, noise + 1.0)):
             starts = [(min(0.0, rms_limits[1]), start) for start in ((0.0, noise) if most else (0.0,))]
             bounds = [rms_limits, (0.0, most)]
-            best = min(
-                (minimize(loss, start, method="L-BFGS-B", bounds=bounds) for start in starts), key=lambda b: b.fun
-            )
+            searches = [minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
+            best = min(searches, key=lambda search: search.fun)
             strength, level = float(np.exp(2.0 * best.x[0])), 0.0
             if most:
                 # What lies far out is part of it.
@@ -357,9 +360,8 @@ class StationaryField:
 
 def _gaussian(count: int, length: float) -> np.ndarray:
     """Return the Gaussian correlations of places on a line, of a length [pixels], shape [n, n]."""
-    places = np.arange(count)
-    correlation = np.exp(-0.5 * ((places[:, None] - places) / length) ** 2)
-    return np.where(correlation > _UNCORRELATED, correlation, 0.0)
+    correlation = np.exp(-0.5 * (np.arange(count) / length) ** 2)
+    return np.asarray(toeplitz(np.where(correlation > _UNCORRELATED, correlation, 0.0)))
 
 
 def _fields(linearized: Linearized, squares: _Squares, resolution: float) -> dict[str, Field]:
