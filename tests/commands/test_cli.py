@@ -305,7 +305,7 @@ def test_too_little_memory_is_one_line(capsys, monkeypatch):
     assert "not enough memory" in refused(capsys, "run")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ctrl_c_ends_with_130_and_resume_goes_on(finished_run, settings_file, tmp_path):
     folder = tmp_path / "out"
     # Eighteen CCDs, each exposed by itself: plenty of time between the first product and the last.
@@ -347,7 +347,7 @@ def test_shells_complete_commands_and_options(tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("arguments", [("info", "hsc"), ("info", "hsc", "--json"), ("--help",), ("operands",)])
+@pytest.mark.parametrize("arguments", [("info", "hsc"), pytest.param(("operands",), marks=pytest.mark.slow)])
 def test_a_reader_that_leaves_ends_a_command_quietly(arguments):
     # Two commands of a shell: "pachon info hsc | head -1", with the status of the first.
     code = "import sys; from pachon.commands.cli import main; sys.exit(main())"

@@ -62,7 +62,7 @@ def test_stamps_without_donuts_are_listed_beside_a_good_one(tmp_path, monkeypatc
     assert reasons == ["ok", "no donut", "no donut", "no donut", dark, dark, "not finite"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, capsys, stamp):
     monkeypatch.chdir(tmp_path)
     header = fits.Header({"FIELD_X": FIELD[0], "FIELD_Y": FIELD[1], "DEFOC_UM": 1500.0})
@@ -137,7 +137,7 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, part):
     assert captured.err.count("\n") == 1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_simulated_file_is_one_that_the_command_reads(tmp_path, monkeypatch, capsys):
     """A decentred M2 under a moved camera: file and fit know what moved, and the file has the truth."""
     monkeypatch.chdir(tmp_path)

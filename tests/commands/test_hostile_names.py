@@ -89,7 +89,9 @@ def test_every_design_command_is_tried():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    "command", [pytest.param(name, marks=[pytest.mark.slow] * (name == "design-report")) for name in COMMANDS]
+)
 def test_nothing_is_written_outside_the_folder_and_names_are_shown(tmp_path, folder, capsys, command):
     before = set(folder.iterdir())
     assert main([command, "lens.yaml", *COMMANDS[command]]) == 0, capsys.readouterr().err

@@ -96,7 +96,7 @@ def test_what_cannot_be_written_is_refused_before_the_optimisation(tmp_path, cap
         assert words in capsys.readouterr().err
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_stop_inside_is_filled_and_it_is_said(capsys):
     """What `optimize` reports is what `spots --aiming real` finds; a lens that got worse is not called better."""
     command = ["optimize", STOP_INSIDE, "--variables", "S6.thickness", "--out", "moved.zmx"]

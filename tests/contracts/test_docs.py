@@ -45,17 +45,19 @@ WITH_FILES = {
     "first_run.md",
     "own_telescope.md",
 }
-#: Pages whose examples need another package, and of those the ones that take seconds.
+#: Pages whose examples need another package, and those that take seconds.
 PEERS = {"batoid.md": "batoid", "from_galsim.md": "galsim", "galsim.md": "galsim", "from_piff.md": "piff"}
-SLOW = {"from_piff.md"}
+SLOW = {"from_piff.md", "donuts.md", "statistical_engine.md", "design_images.md", "stars_to_shear.md"}
 NUMBER = r"[+-]?\b\d+(?:\.\d*)?(?:e[+-]?\d+)?"
 #: Lessons that show what each block prints.
 LESSONS = ("stars_to_shear.md", "wavefronts_from_donuts.md")
-EXAMPLES = [
-    pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW))
-    for name, text in PAGES.items()
-    if BLOCK.search(text) and name not in (*WITH_FILES, *LESSONS)
-]
+
+
+def marked(names):
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in names]
+
+
+EXAMPLES = marked(n for n, text in PAGES.items() if BLOCK.search(text) and n not in (*WITH_FILES, *LESSONS))
 
 
 def test_the_pages_that_users_begin_with_have_examples():
@@ -83,7 +85,7 @@ def number_and_words(text):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", LESSONS)
+@pytest.mark.parametrize("name", marked(LESSONS))
 def test_lessons_print_what_they_show(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     check_shown(name)

@@ -255,7 +255,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_interrupt_while_a_result_is_collected_does_not_wait_for_others(tmp_path):
     (tmp_path / "driver.py").write_text(_DRIVER)
     with subprocess.Popen(

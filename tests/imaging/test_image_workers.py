@@ -27,7 +27,7 @@ def contents(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_workers_write_the_bytes_of_one_process(tmp_path, monkeypatch):
     config = pachon.imaging.ImagesConfig.model_validate(SETTINGS)
     alone = pachon.simulate_images(config, tmp_path / "one")

@@ -153,6 +153,7 @@ def test_the_command_writes_catalogue_and_psf(image, catalogue, tmp_path, capsys
     assert list(json.loads(capsys.readouterr().out)["images"]) == ["image.fits"]
 
 
+@pytest.mark.slow
 def test_images_side_by_side_have_the_same_products(image, tmp_path, capsys):
     for name in ("a", "b"):
         image.write(tmp_path / f"{name}.fits")
@@ -216,7 +217,7 @@ def measured(image, tmp_path_factory):
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-@pytest.mark.parametrize("product", ["psf", "galaxies"])
+@pytest.mark.parametrize("product", [pytest.param("psf", marks=pytest.mark.slow), "galaxies"])
 def test_a_damaged_product_is_made_again_to_the_same_bytes(measured, monkeypatch, catalogue, product, damage):
     folder, whole = measured
     damaged = DAMAGES[damage](whole[f"a_{product}.fits"], whole[f"b_{product}.fits"])

@@ -213,7 +213,7 @@ def test_ccds_computed_apart_make_the_run_of_one_machine(focal_plane_config, tmp
     assert contents(together) == contents(tmp_path / "at_once")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_ccd_that_cannot_be_modelled_is_left_out(focal_plane_config, tmp_path, plane_model, no_report, monkeypatch):
     real, config = run_folder.model_ccd, focal_plane_config(stars__observed=32)
 
@@ -297,7 +297,7 @@ def test_metrics_are_of_both_models(products, focal_plane_config, plane_model):
     assert {"chi2_away_size", "rms_residual_away_ccd"} <= set(metrics["ccd"][CCDS[0]])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_report_has_both_residuals_and_the_warnings(focal_plane_config, tmp_path, plane_model, monkeypatch, capsys):
     drawn = {}
 

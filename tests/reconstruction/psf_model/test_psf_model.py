@@ -290,8 +290,8 @@ def test_splitting_changes_no_byte(basis, interpolation):
     [
         pytest.param({"basis": "shapelets"}, marks=pytest.mark.slow),
         {"interpolation": "kriging", "gain": None},
-        {"masks": True},
-        {"n_components": "auto"},
+        pytest.param({"masks": True}, marks=pytest.mark.slow),
+        pytest.param({"n_components": "auto"}, marks=pytest.mark.slow),
     ],
 )
 def test_bytes_do_not_depend_on_blas_threads(options):
