@@ -21,7 +21,7 @@ from pachon.core.stability import PROVISIONAL
 DOCS = Path(__file__).parents[2] / "docs"
 GALLERY = sorted((DOCS / "gallery").glob("[0-9]*.py"))
 #: Examples of more than a second; CI builds the pages, and so runs them, all the same.
-LONG = {"20_donuts"}
+LONG = {"20_donuts", "26_run", "27_visits"}
 #: Examples whose notebooks end with a desk: design, tolerances, focal plane, donuts, PSF model, visits.
 NOTEBOOKS = {"12_optimise", "13_tolerances", "16_heights", "20_donuts", "26_run", "27_visits"}
 

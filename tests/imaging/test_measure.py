@@ -240,6 +240,7 @@ def test_a_damaged_product_is_made_again_to_the_same_bytes(measured, monkeypatch
     assert len(measured_images) == 1
 
 
+@pytest.mark.slow
 def test_images_of_one_name_have_no_common_folder(image, tmp_path, capsys):
     images = [tmp_path / folder / "image.fits" for folder in ("first", "second")]
     for path in images:

@@ -170,7 +170,7 @@ def test_missing_terms_do_no_harm_where_they_are_expected(behind_focus):
     assert rss(guarded.zernikes[0]) < 15e-9
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_higher_terms_of_the_air_are_fitted_and_its_own_are_an_error(behind_focus):
     air = pachon.Atmosphere.from_site("cerro_pachon", 3, exposure=15.0)
     pupil = behind_focus.pupil_diameter, behind_focus.pupil_obscuration

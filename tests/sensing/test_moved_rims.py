@@ -152,6 +152,7 @@ def obstructed():
 
 
 # 0.9 mm of the filter is a pixel of 10 um of the donut.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("degrees", "shift"),
     [

@@ -38,7 +38,7 @@ def drawn(bins, blur, seed=3):
     return np.random.default_rng(seed).poisson(blurred(bins, blur, 5e6, fine=4) + SKY) - SKY
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_sharp_donut_costs_little_more_than_a_blurred_one(behind_focus, wave, bins):
     """Before, 200 times as much: grids of five cells a pixel, with Fourier transforms for every derivative."""
     images = {blur: drawn(bins, blur) for blur in (0.0, 2.0)}

@@ -283,6 +283,7 @@ def test_stars_with_defects_are_refused(tiny):
         study(config, make_plan(config))
 
 
+@pytest.mark.slow
 def test_command_line(settings_file, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
     command = ["study", str(settings_file), "--threads", "1", "--components", "4", "--snr", "30", "--draws", "1"]

@@ -184,6 +184,7 @@ def no_pictures(monkeypatch):
         monkeypatch.setattr(diagnostics, name, lambda *_: b"")
 
 
+@pytest.mark.slow
 def test_an_unfinished_run_of_one_ccd(run_copy):
     product_path(run_copy, CCDS[1]).unlink()
     result = diagnose(run_copy)

@@ -71,7 +71,7 @@ def test_the_prior_of_rafts_and_ccds_has_the_covariance_of_drawn_focal_planes(pa
     "whole",
     [True, False],
 )
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_prior_of_the_whole_plane_has_the_covariance_of_drawn_ones(part, whole):
     camera = load_camera("lsst") if whole else part("R23", "R33")
     prior = HeightPrior.from_budget(camera)

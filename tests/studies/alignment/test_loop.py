@@ -194,7 +194,7 @@ def test_bad_files_of_states_are_one_line(tmp_path):
         Experiment.from_config(run, tmp_path)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_command_shows_the_loop(traced_donuts, tmp_path, capsys):
     (tmp_path / "loop.yaml").write_text("air: {wavefront: false}\nvisits: 9\n")
     arguments = ["align", str(tmp_path / "loop.yaml"), "-n", "1", "-o", str(tmp_path / "out"), "--quiet", "--json"]

@@ -107,6 +107,7 @@ def test_depth_of_a_stack_of_one_is_that_of_the_visit(night):
     assert np.median(limit[limit.valid_pixels]) == pytest.approx(rows["magLim"][0], abs=0.06)
 
 
+@pytest.mark.slow
 def test_workers_parts_and_interruptions_leave_the_same_bytes(night, night_config, tmp_path, backwards, monkeypatch):
     config, _, files = night
     run_night(config, tmp_path / "workers", execution=Execution(backwards))

@@ -199,6 +199,7 @@ def test_bad_sweeps_end_with_one_line_before_anything_is_computed(folder, capsys
     assert not (folder / "small.sweep").exists()
 
 
+@pytest.mark.slow
 def test_every_metric_gives_finite_figures(folder):
     metrics = ", ".join(m for m in STARS if m != "reconstruction")
     (folder / "small.yaml").write_text(
