@@ -90,7 +90,8 @@ class DonutBench:
     def over_field(self, noll: int) -> PlacesView:
         """Return a Zernike at the fields of the donuts."""
         values = self.zernikes[:, int(np.flatnonzero(self.noll == noll)[0])]
-        return PlacesView(*self.field_deg.T, values, f"Z{noll} [nm]", f"Z{noll} over the field", diverging=True)
+        x, y = self.field_deg.T
+        return PlacesView(x, y, values, f"Z{noll} [nm]", f"Z{noll} over the field", diverging=True)
 
     def images(self, donut: int) -> RowsView | None:
         """Return image, model and difference of a donut over the peak of the model; None without images or a model."""

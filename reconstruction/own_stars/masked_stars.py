@@ -167,7 +167,8 @@ def fill_by_median_star(
         if number < _MEDIAN_PASSES:
             star, moving = _median_star(filled[usable], bad[usable], x[usable], y[usable], sigma), masked
         places = np.stack([x[moving], y[moving]], axis=1)
-        filled[moving], lost[moving] = fill_by_profiles(images[moving], bad[moving], star, *places.T, sigma)
+        near_x, near_y = places.T
+        filled[moving], lost[moving] = fill_by_profiles(images[moving], bad[moving], star, near_x, near_y, sigma)
         shapes = measure_shapes(filled[moving], pixel_scale, weight_fwhm, centers=places, tolerance=0.1 * _CONVERGED)
         x[moving], y[moving] = shapes.x, shapes.y
         usable[moving] = shapes.usable & ~lost[moving]
