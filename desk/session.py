@@ -61,7 +61,7 @@ from .widgets import colour, number_boxes, status_text
 _LIFT = 50.0
 #: Time for further changes to arrive before all are drawn at once [ms].
 _PAUSE = 15
-#: Longest time between two changes of one drag [s].
+#: Longest time between two changes of one drag, that of drawing left out [s].
 _DRAG = 2.0
 #: Largest file of a state that is read [bytes].
 _MOST_BYTES = 10**6
@@ -370,6 +370,7 @@ class Session(PageSession):
     def _draw_scheduled(self) -> None:
         self._waiting = False
         self.redraw_fast()
+        self._changed = monotonic()
         if self.document is not None:
             self.document.add_timeout_callback(self._draw_rest, _PAUSE)
 
@@ -377,6 +378,7 @@ class Session(PageSession):
         # A change that has come in between is drawn first.
         if not self._waiting:
             self.redraw_slow()
+            self._changed = monotonic()
 
     def redraw_fast(self) -> None:
         """Draw spots, wavefront and coarse whiskers, which follow a slider."""

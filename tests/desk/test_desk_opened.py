@@ -77,7 +77,7 @@ def test_states_of_a_telescope_name_the_file_that_it_is_saved_as(desk, triplet, 
 
 
 def test_what_is_nothing_to_show_is_one_line(tmp_path):
-    with pytest.raises(ProductError, match="expected a folder with ccd_"):
+    with pytest.raises(ProductError, match=r"expected the folder of a run \(ccd_"):
         pachon.open_desk(tmp_path)
     with pytest.raises(UnknownNameError):
         pachon.open_desk("lsst_v3.3_rr")
