@@ -151,16 +151,12 @@ class Bench:
     @cached_property
     def variables(self) -> dict[str, str]:
         """Addresses of the degrees of freedom that are one parameter of the telescope each, by name."""
-        alone = {}
+        alone, deformations = {}, {deformation.name for deformation in self.freedoms.deformations}
         for member in self.freedoms.members:
             [(address, weight), *others] = member.of.items()
-            if not others and weight == 1.0 and address.rpartition(".")[0] not in self._deformations:
+            if not others and weight == 1.0 and address.rpartition(".")[0] not in deformations:
                 alone[member.name] = address
         return alone
-
-    @property
-    def _deformations(self) -> set[str]:
-        return {deformation.name for deformation in self.freedoms.deformations}
 
     @cached_property
     def lifted_names(self) -> tuple[str, ...]:

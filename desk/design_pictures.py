@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColumnDataSource, CrosshairTool, FixedTicker, HoverTool, Span
+from bokeh.models import ColumnDataSource, CrosshairTool, HoverTool, Span
 
 from .design_views import Line, MtfView, SensitivityView, projected
 from .pictures import BLUE, GREEN, GREY, ORANGE, THEMES, Picture
@@ -41,8 +41,8 @@ class MtfPicture(Picture):
         """Draw curves, and the tangential one of the state that is compared to."""
         curves = {"t": view.tangential, "s": view.sagittal, "limit": view.limit}
         self.source.data = {"f": view.frequency, **curves}
-        shown = view if reference is None else reference
-        self._compared.data = {"f": shown.frequency, "t": shown.tangential} if reference else {"f": [], "t": []}
+        compared = {"f": [], "t": []} if reference is None else {"f": reference.frequency, "t": reference.tangential}
+        self._compared.data = compared
         self.figure.legend.items[-1].visible = reference is not None
 
 
@@ -69,9 +69,7 @@ class SensitivityPicture(Picture):
             "derivative": [f"{view.derivative[i]:.6g} {view.unit} / {view.units[i]}" for i in order],
             "color": [BLUE if value >= 0 else ORANGE for value in effect],
         }
-        axis = self.figure.yaxis[0]
-        axis.ticker = FixedTicker(ticks=rows)
-        axis.major_label_overrides = dict(zip(rows, names, strict=True))
+        self.name_rows(rows, names)
         self.figure.xaxis.axis_label = f"change by a step of the slider [{view.unit}]"
         self.figure.title.text = f"{view.metric}: {view.value:.4g} {view.unit}"
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from bokeh.document import Document
-from bokeh.layouts import column
 from bokeh.models import Select, Spinner
 
 from .donut_views import DonutBench
@@ -26,10 +25,7 @@ class DonutSession(PageSession):
         self.donut_spinner.on_change("value", lambda attribute, old, new: self.show_donut(new))
         self.term = Select(title="Over the field", value=f"Z{self.noll}", options=[f"Z{j}" for j in bench.noll])
         self.term.on_change("value", lambda attribute, old, new: self.show_term(int(new[1:])))
-        for widget in (self.donut_spinner, self.term):
-            widget.sizing_mode = "stretch_width"
-        parts = [self.donut_spinner, self.term, self.theme_toggle]
-        self.sidebar = column(*parts, name="sidebar", sizing_mode="stretch_width")
+        self._make_sidebar(self.donut_spinner, self.term)
         self.paint("light")
         self.redraw()
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 from bokeh.document import Document
 from bokeh.events import DocumentReady
+from bokeh.layouts import column
 from bokeh.models import Column, CustomJS
 
 from .pictures import Picture
@@ -31,6 +33,11 @@ class PageSession(ABC):
     @abstractmethod
     def state_words(self) -> str:
         """What the page shows, in words."""
+
+    def _make_sidebar(self, *widgets: Any) -> None:
+        for widget in widgets:
+            widget.sizing_mode = "stretch_width"
+        self.sidebar = column(*widgets, self.theme_toggle, name="sidebar", sizing_mode="stretch_width")
 
     def paint(self, theme: str) -> None:
         """Colour the pictures by a theme."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from bokeh.models import (
     ColorBar,
     ColumnDataSource,
     CrosshairTool,
+    FixedTicker,
     HoverTool,
     LinearColorMapper,
     TapTool,
@@ -63,6 +64,12 @@ class Picture:
         self.figure.add_layout(bar, "right")
         self.bars.append(bar)
         return bar
+
+    def name_rows(self, places: Sequence[float], names: Iterable[str]) -> None:
+        """Put names in the place of numbers at the axis of y."""
+        axis = self.figure.yaxis[0]
+        axis.ticker = FixedTicker(ticks=list(places))
+        axis.major_label_overrides = dict(zip(places, names, strict=True))
 
     def paint(self, theme: str) -> None:
         """Colour all but the data by a theme."""

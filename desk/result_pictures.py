@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColumnDataSource, FixedTicker, HoverTool, LinearColorMapper, Span, TapTool, Whisker
+from bokeh.models import ColumnDataSource, HoverTool, LinearColorMapper, Span, TapTool, Whisker
 from bokeh.palettes import Cividis256
 
 from .pictures import BLUE, GREY, ORANGE, MapPicture, Picture, diverging_palette
@@ -28,9 +28,7 @@ class RowsPicture(MapPicture):
         self.source.data = {"image": [stretched], "x": [0.0], "y": [0.0], "w": [width], "h": [height]}
         self.figure.title.text = view.title
         places = [(row + 0.5) * side for row in range(len(view.rows))]
-        axis = self.figure.yaxis[0]
-        axis.ticker = FixedTicker(ticks=places)
-        axis.major_label_overrides = dict(zip(places, reversed(list(view.rows)), strict=True))
+        self.name_rows(places, reversed(list(view.rows)))
 
 
 class _WithErrors(Picture):

@@ -8,7 +8,6 @@ from typing import Any
 
 from bokeh.document import Document
 from bokeh.events import SelectionGeometry, Tap
-from bokeh.layouts import column
 from bokeh.models import BoxAnnotation, Button, RangeSlider, Select
 from bokeh.models.tools import BoxSelectTool
 
@@ -72,9 +71,7 @@ class RunSession(PageSession):
         whole = Button(label="Select all stars")
         whole.on_click(lambda: self.show_state(replace(self.bench.start, kind=self.state.kind, ccd=self.state.ccd)))
         parts = [self.kind, self.ccd, *self.ranges.values(), whole]
-        for widget in parts:
-            widget.sizing_mode = "stretch_width"
-        self.sidebar = column(*parts, self.theme_toggle, name="sidebar", sizing_mode="stretch_width")
+        self._make_sidebar(*parts)
 
     def _range(self, name: str, title: str, step: float) -> RangeSlider:
         low, high = getattr(self.state, name)

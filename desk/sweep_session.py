@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 from bokeh.document import Document
-from bokeh.layouts import column
-from bokeh.models import Button, ColumnDataSource, CustomJS, FixedTicker, HoverTool, RangeSlider, Select, Span, Spinner
+from bokeh.models import Button, ColumnDataSource, CustomJS, HoverTool, RangeSlider, Select, Span, Spinner
 from bokeh.models.tools import BoxSelectTool, TapTool
 from bokeh.transform import dodge
 
@@ -69,9 +68,7 @@ class TornadoPicture(Picture):
         names, rows = list(view.parameters), list(range(len(view.parameters)))
         ranges = list(view.ranges)
         self.source.data = {"row": rows, "name": names, "low": view.low, "high": view.high, "range": ranges}
-        axis = self.figure.yaxis[0]
-        axis.ticker = FixedTicker(ticks=rows)
-        axis.major_label_overrides = dict(zip(rows, names, strict=True))
+        self.name_rows(rows, names)
         self.figure.xaxis.axis_label = view.axis
         self.figure.title.text = "Effects of the parameters"
 
@@ -126,9 +123,7 @@ class SweepSession(PageSession):
         parts: list[Any] = [self.metric_select, self.other_select, self.slice_select, self.slice_range]
         if isinstance(self.bench, SweepBench):
             parts += [self.point, self.open]
-        for widget in parts:
-            widget.sizing_mode = "stretch_width"
-        self.sidebar = column(*parts, self.theme_toggle, name="sidebar", sizing_mode="stretch_width")
+        self._make_sidebar(*parts)
 
     def change(self, axis: str, metric: str) -> None:
         """Draw another metric, or the metric against another one."""

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from bokeh.document import Document
-from bokeh.layouts import column
 from bokeh.models import HoverTool, Select
 
 from .page_session import PageSession
@@ -46,9 +45,8 @@ class NightSession(PageSession):
         self.visit = Select(title="Visit; or click one", value=ALL, options=[ALL, *self.bench.visits])
         parts = {"column": self.column, "band": self.band, "visit": self.visit}
         for name, widget in parts.items():
-            widget.sizing_mode = "stretch_width"
             widget.on_change("value", lambda attribute, old, new, name=name: self.change(**{name: new}))
-        self.sidebar = column(*parts.values(), self.theme_toggle, name="sidebar", sizing_mode="stretch_width")
+        self._make_sidebar(*parts.values())
 
     def _choose(self, row: int) -> None:
         self.visit.value = list(self.bench.shown(self.state))[row]
@@ -92,10 +90,8 @@ class StackSession(PageSession):
         self.stack = Select(title="Visits in the stack", value=self.visits, options=list(bench.stacks))
         self.kinds = Select(title="Shapes", value=self.kind, options=list(STACK_KINDS))
         for name, widget in {"visits": self.stack, "kind": self.kinds}.items():
-            widget.sizing_mode = "stretch_width"
             widget.on_change("value", lambda attribute, old, new, name=name: self.change(name, new))
-        parts = [self.stack, self.kinds, self.theme_toggle]
-        self.sidebar = column(*parts, name="sidebar", sizing_mode="stretch_width")
+        self._make_sidebar(self.stack, self.kinds)
         self.paint("light")
         self.redraw()
 
