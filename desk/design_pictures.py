@@ -41,8 +41,11 @@ class MtfPicture(Picture):
         """Draw curves, and the tangential one of the state that is compared to."""
         curves = {"t": view.tangential, "s": view.sagittal, "limit": view.limit}
         self.source.data = {"f": view.frequency, **curves}
-        compared = {"f": [], "t": []} if reference is None else {"f": reference.frequency, "t": reference.tangential}
-        self._compared.data = compared
+        none = np.empty(0)
+        self._compared.data = {
+            "f": none if reference is None else reference.frequency,
+            "t": none if reference is None else reference.tangential,
+        }
         self.figure.legend.items[-1].visible = reference is not None
 
 
