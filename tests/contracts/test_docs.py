@@ -47,7 +47,14 @@ WITH_FILES = {
 }
 #: Pages whose examples need another package, and those that take seconds.
 PEERS = {"batoid.md": "batoid", "from_galsim.md": "galsim", "galsim.md": "galsim", "from_piff.md": "piff"}
-SLOW = {"from_piff.md", "donuts.md", "statistical_engine.md", "design_images.md", "stars_to_shear.md"}
+SLOW = {
+    "from_piff.md",
+    "donuts.md",
+    "statistical_engine.md",
+    "design_images.md",
+    "stars_to_shear.md",
+    "wavefronts_from_donuts.md",
+}
 NUMBER = r"[+-]?\b\d+(?:\.\d*)?(?:e[+-]?\d+)?"
 #: Lessons that show what each block prints.
 LESSONS = ("stars_to_shear.md", "wavefronts_from_donuts.md")

@@ -12,7 +12,7 @@ pytest.importorskip("mypy")
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_mypy(tmp_path):
     # The folders stand at the top level and become one package only when installed. mypy cannot follow
     # the path that `pachon` adds in a checkout.

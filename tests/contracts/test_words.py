@@ -23,16 +23,16 @@ WORDS = frozenset(
 LARGEST_SHARE = 0.02
 
 
+@pytest.fixture(scope="module")
 def product_trees():
-    for room in ROOMS:
-        for path in sorted((ROOT / room).rglob("*.py")):
-            yield path, ast.parse(path.read_text(encoding="utf-8"))
+    paths = [path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
+    return [(path, ast.parse(path.read_text(encoding="utf-8"))) for path in paths]
 
 
 @pytest.mark.long
-def test_locals_are_named_by_what_they_hold():
+def test_locals_are_named_by_what_they_hold(product_trees):
     functions, pronouns = 0, []
-    for path, tree in product_trees():
+    for path, tree in product_trees:
         for node in ast.walk(tree):
             if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
                 functions += 1
@@ -44,11 +44,11 @@ def test_locals_are_named_by_what_they_hold():
 
 
 @pytest.mark.long
-def test_constants_stand_one_a_line():
+def test_constants_stand_one_a_line(product_trees):
     """A line such as ``A, B = 1.0, 2.0`` leaves no place for the unit and the reason of each."""
     packed = [
         f"{path.relative_to(ROOT)}:{node.lineno} {value.value}"
-        for path, tree in product_trees()
+        for path, tree in product_trees
         for node in tree.body
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple)
         for value in node.value.elts
