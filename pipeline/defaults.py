@@ -38,7 +38,7 @@ from .config_checks import WEIGHT_PIXELS, check_combinations
 from .photometry import band_of, pixel_angle, resolved_photometry
 from .resolved_values import resolved_value
 from .simulate.photometry import PROVISIONAL_FWHM, limiting_magnitude, saturation_magnitude
-from .simulate.screen_cover import check_screens
+from .simulate.screen_cover import check_screens, corner_fields
 
 _WAVELENGTHS = 5
 #: Largest number of CCDs of a camera that is computed whole by default.
@@ -145,6 +145,8 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     )
     telescope = configured_telescope(telescope, resolved)
     check_combinations(resolved, telescope, _pixel_arcsec(resolved.psf, telescope))
+    # Stars may fall anywhere on a CCD: all of it must be within the field.
+    corner_fields(telescope, camera, resolved.ccds or ())
     check_screens(resolved, telescope, camera, site)
     return ResolvedConfiguration(resolved, telescope, camera, site)
 

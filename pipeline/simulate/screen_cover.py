@@ -15,7 +15,7 @@ from ...models.telescope import Telescope
 from ...wavefront.atmosphere.layers import line_of_sight
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.engines import ENGINES
-from ...wavefront.psf.fast import LEAST_SAMPLES, least_screen_size
+from ...wavefront.psf.fast import LEAST_SAMPLES, largest_screen_length, least_screen_size
 from ..config import Configuration
 
 
@@ -36,7 +36,9 @@ def corner_fields(telescope: Telescope, camera: Camera, names: Sequence[str]) ->
     """Return the field angles of the corners of CCDs [rad], [n, 2]; ConfigError names those beyond the field."""
 
     def fields(some: Sequence[str]) -> np.ndarray:
-        return fields_at(telescope, camera.corners(camera.ccd_index(name) for name in some).reshape(-1, 2))
+        found = fields_at(telescope, camera.corners(camera.ccd_index(name) for name in some).reshape(-1, 2))
+        telescope.check_field(*found.T)
+        return found
 
     try:
         return fields(names)
@@ -79,8 +81,9 @@ def check_samples(config: Configuration, telescope: Telescope) -> None:
         return
     least = least_screen_size(telescope.pupil_diameter, air.screen_length_m)
     if air.screen_size < least:
+        longest = largest_screen_length(telescope.pupil_diameter, air.screen_size)
         raise ConfigError(
             f"atmosphere.screen_size = {air.screen_size}: expected at least {least}, "
-            f"so that a pupil of {telescope.pupil_diameter:g} m has {LEAST_SAMPLES} samples across, or a shorter "
-            f"atmosphere.screen_length_m than {air.screen_length_m:g}"
+            f"so that a pupil of {telescope.pupil_diameter:g} m has {LEAST_SAMPLES} samples across, or "
+            f"atmosphere.screen_length_m of at most {longest:g}"
         )

@@ -185,15 +185,18 @@ def test_defaults_follow_the_camera(telescope, ccds, pixel, scale):
         ({"camera": "hcs"}, "camera.*unknown camera 'hcs': did you mean hsc"),
         ({"camera": "nothing.yaml"}, "nothing.yaml: no such file"),
         ({"camera": "far.yaml"}, "ccds: B of two reach beyond the field that hsc covers, 1 deg"),
+        # Chief rays to B are found, but beyond 1 deg.
+        ({"camera": "near.yaml"}, "ccds: B of two reach beyond the field that hsc covers, 1 deg"),
         ({"ccds": ["R22_S11"]}, "unknown CCD of hsc 'R22_S11'"),
         ({"ccds": ["R22"]}, "unknown CCD of hsc 'R22'"),
-        ({"atmosphere": {"screen_size": 256, "screen_length_m": 800}}, "expected at least 391, so that a pupil of 8.2"),
+        ({"atmosphere": {"screen_size": 256, "screen_length_m": 800}}, "at least 391, .* of at most 524"),
         ({"sensor": {"brighter_fatter": "itl"}}, "psf.pixel_um = 15: expected 10"),
         ({"focal_plane": {"heights": "lsstcam"}}, "heights = lsstcam: expected heights of the telescope's camera, hsc"),
     ],
 )
 def test_what_does_not_fit_is_one_line(tmp_path, changes, words):
     (tmp_path / "far.yaml").write_text(TURNED.replace("x_mm: 30", "x_mm: 600"))
+    (tmp_path / "near.yaml").write_text(TURNED.replace("x_mm: 30", "x_mm: 330"))
     with pytest.raises(PachonError, match=words) as caught:
         small(tmp_path, **changes)
     assert "\n" not in str(caught.value)

@@ -92,6 +92,11 @@ def least_screen_size(diameter: float, screen_length: float) -> int:
     return math.ceil(LEAST_SAMPLES * screen_length / diameter)
 
 
+def largest_screen_length(diameter: float, screen_size: int) -> float:
+    """Return the length [m] up to which a screen of so many samples is fine enough for a pupil [m], in full tenths."""
+    return math.floor(10.0 * screen_size * diameter / LEAST_SAMPLES) / 10.0
+
+
 @check_arguments
 @dataclass(frozen=True)
 class FastEngine(PsfEngine):
@@ -179,7 +184,8 @@ class FastRenderer(PsfRenderer):
             if self._atmosphere.screen_size < least:
                 raise DomainError(
                     f"screen_size = {self._atmosphere.screen_size}: expected at least {least}, so that a pupil of"
-                    f" {diameter:g} m has {LEAST_SAMPLES} samples across"
+                    f" {diameter:g} m has {LEAST_SAMPLES} samples across, or a screen_length of at most"
+                    f" {largest_screen_length(diameter, self._atmosphere.screen_size):g} m"
                 )
         self._lattice = PupilLattice.fill(diameter, obscuration, spacing / self._refinement)
         self._points = self._lattice.points
