@@ -20,7 +20,9 @@ app = typer.Typer()
 ImagesSettings = Annotated[list[str] | None, set_option("images")]
 
 #: Settings of --quick: the mean over all turbulence, the middle of a CCD, galaxies that a few minutes would show.
-_QUICK = {"run__psf__engine": "long_exposure", "galaxies__faintest": 26.0, "image__side": 1024}
+_QUICK = {"run__psf__engine": "long_exposure", "galaxies__faintest": 26.0}
+#: Side of the images of --quick [pixels], where none is set and CCDs are not smaller.
+_QUICK_SIDE = 1024
 
 
 @app.command("images")
@@ -92,6 +94,8 @@ def images_command(
 
     folder = None if config is None else config.parent
     base = ImagesConfig() if config is None else load_images_configuration(config)
+    if quick:
+        base = with_options(base, **_QUICK)
     if settings:
         base = with_files(with_set_keys(base, settings), folder or Path())
     options = {
@@ -102,7 +106,7 @@ def images_command(
         "image__noise": noise,
         "galaxies__faintest": faintest,
     }
-    images_config = with_options(with_options(base, **(_QUICK if quick else {})), **options)
+    images_config = with_options(base, **options)
     if visit_list is None:
         require_list(("--visit", visit), ("--where", where), ("--band", band), ("--night", night))
     else:
@@ -110,6 +114,9 @@ def images_command(
             listed_visit(images_config.run, visit_list, visit, where, band, night), folder
         )
     experiment = images_config.experiment(folder)
+    if quick and images_config.image.side is None:
+        side = min(_QUICK_SIDE, int(experiment.camera.pixels.min()))
+        images_config = with_options(images_config, image__side=side)
     hint = f"finished CCDs are in {out}, and --resume goes on from there"
     with long_work(
         quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers

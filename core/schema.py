@@ -94,7 +94,7 @@ def validated(
             # A misspelt key is the likelier cause of the other problems, so it goes first.
             errors = problems.errors(include_url=False)
             first = min(errors, key=lambda p: p["type"] != "unknown_key")
-            first_error = _one_line_error(first, content, source, error, others=errors)
+            first_error = _one_line_error(first, content, source, error, others=errors, model=model)
             if drop is None or first["type"] != "unknown_key":
                 raise first_error from None
             drop(first_error)
@@ -116,7 +116,7 @@ def problems_of(
         except ValidationError as problems:
             errors = problems.errors(include_url=False)
             unknown = [p for p in errors if p["type"] == "unknown_key"]
-            all_errors += [_one_line_error(p, content, source, error) for p in unknown or errors]
+            all_errors += [_one_line_error(p, content, source, error, model=model) for p in unknown or errors]
             for unknown_problem in unknown:
                 del unknown_problem["input"][unknown_problem["ctx"]["key"]]
             if unknown:
@@ -328,13 +328,19 @@ def _one_line_error(
     error: type[PachonError],
     *,
     others: Iterable[Mapping[str, Any]] = (),
+    model: type[BaseModel],
 ) -> PachonError:
-    """Return the error of a problem; one of a missing key names those that `others` miss too."""
+    """Return the error of a problem; one of a missing key names those that `others` miss too.
+
+    A key that is unknown at the top of a file, but known in sections of its model, is said to be theirs.
+    """
     kind, value, limits = problem["type"], problem["input"], problem.get("ctx", {})
     path = _key_path([*problem["loc"], *filter(None, [limits.get("key")])], content)
     if kind == "unknown_key":
         key, allowed_keys = limits["key"], limits["allowed"]
-        hint = nearest(key, allowed_keys) or f"expected one of {', '.join(allowed_keys)}"
+        inner = [known for known in known_keys(model) if known.endswith(f".{key}")] if path == key else []
+        hint = f"did you mean {' or '.join(inner[:2])}?" if inner else nearest(key, allowed_keys)
+        hint = hint or f"expected one of {', '.join(allowed_keys)}"
         return error(f"unknown key {path} = {_value_text(error, value[key])}: {hint}", file=source, key=path)
     if kind == "problem":
         return error(f"{path}{limits['text']}", file=source, key=path)

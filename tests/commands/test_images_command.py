@@ -9,6 +9,7 @@ from astropy.io import fits
 from astropy.table import Table
 from PIL import Image
 
+from pachon import PachonError
 from pachon.commands.cli import main
 from pachon.imaging.image_file import CcdImage
 
@@ -183,6 +184,7 @@ def test_the_run_may_be_a_file(settings, tmp_path, capsys):
         ({}, ["--ccds", "R22_S44"], "R22_S44"),
         ({}, ["--way", "fast"], "--way = 'fast'"),
         ({"run__atmosphere": {"enabled": False}, "run__psf": {}}, [], "atmosphere.enabled = false"),
+        ({}, ["--set", "telescope=lsst_v3.3_r"], "did you mean run.telescope?"),
     ],
 )
 def test_bad_input_is_one_line(settings, tmp_path, capsys, options, arguments, text):
@@ -195,3 +197,20 @@ def test_bad_input_is_one_line(settings, tmp_path, capsys, options, arguments, t
 def test_help_teaches_by_example(capsys):
     assert run("--help") == 0
     assert "pachon images --ccds R22_S11 --quick" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(("arguments", "side"), [([], 500), (["--set", "image.side=200"], 200)])
+def test_a_quick_look_fits_the_camera_and_gives_way_to_what_is_set(tmp_path, monkeypatch, arguments, side):
+    ccds = "[{name: A, x_mm: 0, y_mm: 0}]"
+    (tmp_path / "own.yaml").write_text(f"name: own\nsource: test\npixel_um: 10\npixels: [500, 600]\nccds: {ccds}\n")
+    drawn = []
+
+    def simulated(config, *_, **__):
+        drawn.append(config)
+        raise PachonError("far enough")
+
+    monkeypatch.setattr("pachon.imaging.simulate.simulate_images", simulated)
+    camera = ["--set", f"run.camera={tmp_path / 'own.yaml'}"]
+    assert run("--quick", *camera, *arguments, "-o", str(tmp_path / "out"), "--quiet") == 2
+    assert drawn[0].image.side == side
+    assert drawn[0].run.psf.engine == "long_exposure"
