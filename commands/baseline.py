@@ -14,7 +14,19 @@ from . import completion
 from .choices import names
 from .help_group import HelpGroup
 from .interrupt import interruptible
-from .options import FieldsDeg, Json, Model, Quiet, Threads, WavelengthsNm, ccd_list, field_list, name_list, yaml_file
+from .options import (
+    FieldsDeg,
+    Json,
+    Model,
+    Quiet,
+    Settings,
+    Threads,
+    WavelengthsNm,
+    ccd_list,
+    field_list,
+    name_list,
+    yaml_file,
+)
 from .tables import print_json
 
 app = typer.Typer()
@@ -45,6 +57,7 @@ def baseline_save(
     config: Annotated[
         Path | None, yaml_file("RUN.yaml", "Run configuration, by its file: adds heights, PSFs, a PSF model.")
     ] = None,
+    settings: Settings = None,
     field_deg: FieldsDeg = None,
     wavelength_nm: WavelengthsNm = None,
     ccds: Annotated[str | None, ccd_list("CCDs for PSFs, with commas; the first is modelled.")] = None,
@@ -90,6 +103,7 @@ def baseline_save(
             wavelengths=[nm / 1e9 for nm in wavelength_nm] if wavelength_nm else None,
             ccds=None if ccds is None else name_list(ccds, "--ccds"),
             requirements=Requirements(tuple(tolerance or ()), tuple(limit or ())),
+            settings=settings or (),
             threads=threads,
             progress=stage.advance,
         )
@@ -146,6 +160,7 @@ def check_command(
     config: Annotated[
         Path | None, yaml_file("RUN.yaml", "Run configuration, by its file, in place of its own.")
     ] = None,
+    settings: Settings = None,
     everything: Annotated[bool, Option("--all", help="Show all metrics, not the worst alone.")] = False,
     threads: Threads = None,
     as_json: Json = False,
@@ -162,18 +177,23 @@ def check_command(
     - `pachon check`: does this installation agree with the one that was verified?
     - `pachon check telescope.baseline.json`: after a change of the prescription, in CI
     - `pachon check telescope.baseline.json --model as_built.yaml --json`
+    - `pachon check telescope.baseline.json --set focal_plane.budget_seed=2`: with another key of its configuration
     """
     from ..studies.baseline.baseline import bundled_baselines, check_baseline
     from ..studies.metrics.camera import CAMERA
     from ..studies.metrics.optics import OPTICS
 
-    if not files and (model is not None or config is not None):
-        raise ConfigError("pachon check: expected a FILE with --model or --config")
+    if not files and (model is not None or config is not None or settings):
+        raise ConfigError("pachon check: expected a FILE with --model, --config or --set")
     checks = []
     with interruptible(quiet or as_json) as reporter:
         for path in files or bundled_baselines():
             with reporter.stage(path.name, len(OPTICS) + len(CAMERA)) as stage:
-                checks.append(check_baseline(path, model, config, threads=threads, progress=stage.advance))
+                checks.append(
+                    check_baseline(
+                        path, model, config, settings=settings or (), threads=threads, progress=stage.advance
+                    )
+                )
     passed = all(check.passed for check in checks)
     if as_json:
         print_json({"passed": passed, "baselines": [check.summary() for check in checks]})

@@ -21,7 +21,10 @@ class Kind(NamedTuple):
 #: Kinds of configurations, the first that of keys without a kind.
 KINDS = {
     "run": Kind(
-        "pipeline.config", "Configuration", "run, attribute, study, shim, camera", "telescope, sky and PSF models"
+        "pipeline.config",
+        "Configuration",
+        "run, attribute, study, shim, camera, baseline save, check",
+        "telescope, sky and PSF models",
     ),
     "images": Kind("imaging.config", "ImagesConfig", "images", "images of galaxies and stars"),
     "visits": Kind("studies.visits.config", "VisitsConfig", "visits", "stacks of visits to one field"),

@@ -8,7 +8,7 @@ from typer import Option
 
 from ...core.errors import ConfigError
 from ..choices import choice
-from ..tables import FIELD, Column, Rows, number_texts
+from ..tables import FIELD, Column, Rows, number_texts, range_text
 from .command import Outcome, SharedOptions, Study, design_command
 
 if TYPE_CHECKING:
@@ -101,11 +101,26 @@ def lateral_color(shared: SharedOptions) -> Study:
     return compute(*shared.first_arguments, **shared.trace_options)
 
 
+def _focal_shift_verdict(summary: dict[str, Any]) -> str:
+    """Return how far the focus moves over the wavelengths, or over the pupil where there is one wavelength alone."""
+    depth = f"the depth of focus is ±{_length(summary['depth_of_focus_um'])}"
+    if len(summary["wavelength_nm"]) == 1:
+        zones = summary["shift_um"][0]
+        return f"The foci of the zones differ by {_length(max(zones) - min(zones))}; {depth}."
+    band = range_text(summary["wavelength_nm"], ".6g", "nm")
+    return f"Over {band} the paraxial focus moves by {_length(summary['largest_paraxial_shift_um'])}; {depth}."
+
+
+def _length(micrometres: float) -> str:
+    return f"{micrometres:.4g} µm" if micrometres < 1e3 else f"{micrometres / 1e3:.4g} mm"
+
+
 @design_command(
     Column("wavelength [nm]", "wavelength_nm", ".6g"),
     Column("shift [µm], zone by zone", "shift_um", ".4f"),
     caption="Paraxial, then by zones of the pupil; against the paraxial focus at {reference_nm:.6g} nm.",
     left=0,
+    verdict=_focal_shift_verdict,
     band=True,
 )
 def focal_shift(
@@ -155,7 +170,23 @@ def _seidel_rows(result: SeidelDiagram) -> Rows:
     rows = [(name, *(f"{v:.4f}" for v in row)) for name, row in zip(names, values, strict=True)]
     headings = [f"{symbol} {name}" for symbol, name in zip(s["coefficients"], s["aberrations"], strict=True)]
     caption = f"{s['telescope']}: waves at {s['wavelength_nm'][0]:.6g} nm; colours between the edges of the band."
-    return Rows(("surface", *headings), rows, caption)
+    return Rows(("surface", *headings), rows, caption, verdict=_seidel_verdict(s))
+
+
+def _seidel_verdict(summary: dict[str, Any]) -> str:
+    """Return the largest aberration of the sum, and the surface that adds most; distortion does not blur."""
+    import numpy as np
+
+    blurring = [k for k, name in enumerate(summary["aberrations"]) if name != "distortion"]
+    total, of_surfaces = (np.array(summary[key])[..., blurring] for key in ("total_waves", "waves"))
+    worst = np.abs(total).argmax()
+    if np.abs(total[worst]) < 5e-5:
+        return f"Beside distortion, all sums vanish; one surface has up to {np.abs(of_surfaces).max():.4g} waves."
+    strongest = np.abs(of_surfaces[:, worst]).argmax()
+    return (
+        f"Largest beside distortion is {summary['aberrations'][blurring[worst]]}, {total[worst]:.4f} waves at the rims "
+        f"of pupil and field; {summary['surfaces'][strongest]} alone has {of_surfaces[strongest, worst]:.4f}."
+    )
 
 
 def _matrix_heading(summary: dict[str, Any]) -> str:

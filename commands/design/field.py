@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Option
 
@@ -12,6 +12,7 @@ from ...core.errors import ConfigError
 from .. import completion
 from ..choices import names
 from ..tables import Column, Rows, field_headings, number_texts, range_text
+from ..verdicts import counted
 from .command import Outcome, SharedOptions, design_command
 
 if TYPE_CHECKING:
@@ -137,7 +138,27 @@ def _footprint_rows(result: Footprint) -> Rows:
         "Reaches to: largest distance from the vertex of light that arrives. Then, field by field, the part of the "
         "pupil [%] that the surface is the first to block."
     )
-    return Rows(("surface", "reaches to [mm]", *fields), rows, caption)
+    return Rows(("surface", "reaches to [mm]", *fields), rows, caption, verdict=_footprint_verdict(result))
+
+
+def _footprint_verdict(result: Footprint) -> str:
+    """Return the surface that blocks most of the pupil, and at which field."""
+    import numpy as np
+
+    blocked = np.array([s.blocked_fraction for s in result.surfaces])
+    surface, field = np.unravel_index(blocked.argmax(), blocked.shape)
+    if blocked[surface, field] == 0.0:
+        return "None of the surfaces blocks light."
+    name, where = result.surfaces[surface].name, field_headings(result)[field]
+    return f"{name} blocks most: {100.0 * blocked[surface, field]:.2f} % of the pupil at field {where}."
+
+
+def _layout_verdict(summary: dict[str, Any]) -> str:
+    """Return the size of a telescope, and of how many mirrors and lenses it is."""
+    width, _, length = (f"{x:.4g} m" if x >= 1.0 else f"{1e3 * x:.4g} mm" for x in summary["extent_m"])
+    mirrors = counted([*summary["interaction"]].count("mirror"), "mirror")
+    lenses = counted(len(summary["lens"]), "lens", "lenses")
+    return f"{mirrors} and {lenses}, {length} long and {width} wide."
 
 
 @design_command(
@@ -146,6 +167,7 @@ def _footprint_rows(result: Footprint) -> Rows:
     Column("vertex [mm]", "vertex_m", ".6g", 1e3),
     Column("drawn to [mm]", "drawn_radius_m", ".4g", 1e3),
     left=2,
+    verdict=_layout_verdict,
 )
 def draw(
     shared: SharedOptions,

@@ -157,4 +157,6 @@ def _target_rows(result: TargetImage) -> Rows:
         ("pixel of the image", f"{s['pixel_um']:.5g} µm"),
         ("light on the image", f"{100 * s['light_inside']:.3f} %"),
     ]
-    return Rows(("metric", "value"), rows, f"{s['telescope']}: diffraction is left out.")
+    light = f"{100 * s['light_inside']:.3f} %"
+    verdict = f"The image has {light} of the target's light, on pixels of {s['pixel_um']:.5g} µm."
+    return Rows(("metric", "value"), rows, f"{s['telescope']}: diffraction is left out.", verdict=verdict)

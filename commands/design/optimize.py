@@ -38,6 +38,24 @@ def _largest_terms(result: Any) -> list[str]:
     return [", ".join(f"Z{j}" for j in terms) for terms in (size.argsort(axis=0)[::-1][:3] + 4).T]
 
 
+def _sensitivity_verdict(summary: dict[str, Any]) -> str:
+    """Return the parameter of each unit that changes the wavefront most, for a small step of it."""
+    from ...core.units import ARCSEC
+
+    # Small steps, by the unit of the parameter: their size and name.
+    steps = {"m": (1e-6, "µm"), "rad": (ARCSEC, "arcsec"), "um": (1.0, "µm"), "1": (1.0, "unit")}
+    strongest: dict[str, tuple[float, str]] = {}
+    for name, unit, rms in zip(
+        summary["parameters"], summary["units"], summary["wavefront_rms_m_per_unit"], strict=True
+    ):
+        strongest[unit] = max(strongest.get(unit, (-1.0, "")), (float(rms), name))
+    changes = []
+    for unit, (rms, name) in strongest.items():
+        size, step = steps.get(unit, (1.0, unit))
+        changes.append(f"{name}, by {1e9 * rms * size:.4g} nm rms per {step}")
+    return f"The wavefront changes most with {', and '.join(changes)}."
+
+
 @design_command(
     Column("parameter", lambda result: result.parameters.names),
     Column("largest Noll terms", _largest_terms),
@@ -45,6 +63,7 @@ def _largest_terms(result: Any) -> list[str]:
     Column("unit", lambda result: ["m" if unit == "1" else f"m/{unit}" for unit in result.parameters.units]),
     caption="Rms over the fields, piston and tilt left out.",
     left=2,
+    verdict=_sensitivity_verdict,
 )
 def sensitivity(
     shared: SharedOptions,

@@ -17,12 +17,13 @@ import numpy as np
 
 from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import ConfigError, PachonError
+from ...core.set_keys import OPTION, with_set_keys
 from ...core.version import VERSION
 from ...models.io.bundled import BUNDLED
 from ...models.io.prescription import load_telescope
 from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
-from ...pipeline.config import digest, load_configuration, with_options
+from ...pipeline.config import Configuration, digest, load_configuration, with_options
 from ...pipeline.config_hash import hashed_camera, hashed_heights, hashed_photometry, hashed_states
 from ...pipeline.defaults import configured_telescope, with_paper_model
 from ...pipeline.experiment import Experiment
@@ -58,6 +59,7 @@ def make_baseline(
     ccds: Sequence[str] | None = None,
     pupil: Sequence[tuple[float, float]] | None = None,
     requirements: Requirements | None = None,
+    settings: Sequence[str] = (),
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[Baseline, dict[str, str]]:
@@ -81,6 +83,8 @@ def make_baseline(
         Points of the entrance pupil, in units of its radius; four by default.
     requirements : Requirements, optional
         Tolerances in place of those of rounding, and limits.
+    settings : sequence of str, optional
+        Other values of keys of the configuration, such as ``"stars.truth=50"``; the baseline keeps them.
     threads : int, optional
         Number of threads; results do not depend on it.
     progress : callable, optional
@@ -102,7 +106,12 @@ def make_baseline(
     tolerance_rules, limit_rules = requirements.tolerance_rules, requirements.limit_rules
     telescope, folder = load_telescope(model), Path(folder)
     configuration = None if configuration is None else Path(configuration)
-    experiment = None if configuration is None else _experiment(configuration, _absolute_path(model, Path()), telescope)
+    if configuration is None:
+        _refuse_settings(settings)
+        experiment = None
+    else:
+        run = with_set_keys(load_configuration(configuration), settings)
+        experiment = _experiment(run, configuration, _absolute_path(model, Path()), telescope)
     plan = make_plan(telescope, experiment, fields, wavelengths, ccds, pupil)
     scene = Scene(telescope if experiment is None else experiment.telescope, experiment, plan, threads)
     measurements, left_out = _measured_metrics(scene, OPTICS if experiment is None else {**OPTICS, **CAMERA}, progress)
@@ -128,6 +137,7 @@ def make_baseline(
         **_input_stamps(telescope, experiment),
         model=_relative_path(model, folder, BUNDLED),
         configuration=None if configuration is None else _relative_path(str(configuration), folder, ()),
+        settings=tuple(settings),
         plan=plan,
         reasons={key: text for key, text in REASONS.items() if any(m.reason == key for m in metrics.values())},
         figures=metrics,
@@ -141,6 +151,7 @@ def check_baseline(
     model: str | os.PathLike[str] | Telescope | None = None,
     configuration: str | os.PathLike[str] | None = None,
     *,
+    settings: Sequence[str] = (),
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> BaselineCheck:
@@ -153,7 +164,9 @@ def check_baseline(
     model : str, path or Telescope, optional
         Telescope in place of the baseline's own.
     configuration : str or path, optional
-        Run configuration in place of the baseline's own.
+        Run configuration in place of the baseline's own, with its settings.
+    settings : sequence of str, optional
+        Other values of keys of the configuration, such as ``"stars.truth=50"``; they win over those of the baseline.
     threads, progress
         As in :func:`make_baseline`.
 
@@ -164,7 +177,7 @@ def check_baseline(
     """
     path = Path(path)
     baseline = read_baseline(path)
-    name, telescope, experiment = _checked_telescope(path, baseline, model, configuration)
+    name, telescope, experiment = _checked_telescope(path, baseline, model, configuration, settings)
     scene = Scene(telescope if experiment is None else experiment.telescope, experiment, baseline.plan, threads)
     stored = {key.partition(" ")[0] for key in baseline.figures}
     groups = {key: group for key, group in {**OPTICS, **CAMERA}.items() if key in stored}
@@ -198,7 +211,7 @@ def updated_baseline(
             raise ConfigError(f"figures.{d.name}: {d.problem}; remove its line, or save the baseline anew", file=path)
         update = {"value": rounded(d.found, d.tolerance), "checked_against": None}
         metrics[d.name] = metrics[d.name].model_copy(update=update)
-    _, telescope, experiment = _checked_telescope(path, baseline, None, None)
+    _, telescope, experiment = _checked_telescope(path, baseline)
     return baseline.model_copy(update={**_input_stamps(telescope, experiment), "figures": metrics}), check
 
 
@@ -228,8 +241,9 @@ def prescription_hash(telescope: Telescope) -> str:
 def _checked_telescope(
     path: Path,
     baseline: Baseline,
-    model: str | os.PathLike[str] | Telescope | None,
-    configuration: str | os.PathLike[str] | None,
+    model: str | os.PathLike[str] | Telescope | None = None,
+    configuration: str | os.PathLike[str] | None = None,
+    settings: Sequence[str] = (),
 ) -> tuple[str, Telescope, Experiment | None]:
     """Return the name of the telescope to check, itself, and the experiment with it."""
     stored_model = _absolute_path(baseline.model, path.parent)
@@ -243,26 +257,40 @@ def _checked_telescope(
         except PachonError as error:
             raise (error.within(subject="model").within(file=path) if model is None else error) from None
     if configuration is not None:
-        return name, telescope, _experiment(Path(configuration), source, telescope)
+        file = Path(configuration)
+        run = with_set_keys(load_configuration(file), settings)
+        return name, telescope, _experiment(run, file, source, telescope)
     if baseline.configuration is None:
+        _refuse_settings(settings)
         return name, telescope, None
+    file = path.parent / baseline.configuration
     try:
-        return name, telescope, _experiment(path.parent / baseline.configuration, source, telescope)
+        stored_run = with_set_keys(load_configuration(file), baseline.settings)
+    except PachonError as error:
+        raise error.within(subject="configuration").within(file=path) from None
+    run = with_set_keys(stored_run, settings)
+    try:
+        return name, telescope, _experiment(run, file, source, telescope)
     except PachonError as error:
         raise error.within(subject="configuration").within(file=path) from None
 
 
-def _experiment(configuration: Path, model: str, telescope: Telescope) -> Experiment:
-    """Return the experiment of a configuration with this telescope and the long-exposure engine."""
-    base = load_configuration(configuration)
-    engine = "long_exposure" if base.atmosphere.enabled else None
+def _refuse_settings(settings: Sequence[str]) -> None:
+    """Raise ConfigError if there are values of keys without a configuration to have them."""
+    if settings:
+        raise ConfigError(f"{OPTION} {settings[0]}: expected a configuration, such as --config run.yaml")
+
+
+def _experiment(run: Configuration, file: Path, model: str, telescope: Telescope) -> Experiment:
+    """Return the experiment of the configuration of a file with this telescope and the long-exposure engine."""
+    engine = "long_exposure" if run.atmosphere.enabled else None
     try:
         # Kriging looks for its covariance in steps that rounding may change; metrics need a model of one solution.
-        config = with_options(with_paper_model(base), telescope=model, psf__engine=engine)
-        experiment = Experiment.from_config(config, configuration.parent)
+        config = with_options(with_paper_model(run), telescope=model, psf__engine=engine)
+        experiment = Experiment.from_config(config, file.parent)
         return replace(experiment, telescope=configured_telescope(telescope, experiment.config))
     except PachonError as error:
-        raise ConfigError(f"{configuration}: {error}") from None
+        raise ConfigError(f"{file}: {error}") from None
 
 
 def _input_stamps(telescope: Telescope, experiment: Experiment | None) -> dict[str, Any]:

@@ -23,8 +23,8 @@ from ...core.schema import Positive, Real, Section, validated
 from ..metrics.scene import Plan
 
 FORMAT = "pachon baseline"
-#: Versions of the format: 4 has limits, which an older pachon could not read, and is written for these alone. Those of
-#: 1 and 2 are 3 and 4 with the CCDs of the LSST named as in a mirror, and are read where they name none.
+#: Versions of the format: 4 has limits or settings, unknown to an older pachon, and is written for these alone.
+#: Those of 1 and 2 are 3 and 4 with the CCDs of the LSST named as in a mirror, and are read where they name none.
 VERSIONS = (3, 4)
 _OLDER_VERSIONS = (1, 2)
 
@@ -70,6 +70,7 @@ class Baseline(Section):
     model: str = Field(description="bundled telescope, or path of its file from the folder of this one")
     model_sha256: str = Field(description="SHA-256 of the prescription as pachon writes it")
     configuration: str | None = Field(None, description="path of the run configuration from the folder of this file")
+    settings: tuple[str, ...] = Field((), description="other values of keys of the configuration, KEY=VALUE each")
     configuration_sha256: str | None = Field(None, description="SHA-256 of the configuration with all defaults")
     plan: Plan
     reasons: dict[str, str] = Field(description="reasons of the tolerances")
@@ -132,8 +133,9 @@ def write_baseline(path: str | os.PathLike[str], baseline: Baseline) -> None:
 def baseline_text(baseline: Baseline) -> str:
     """Return the file's text."""
     content = baseline.model_dump(mode="json", exclude={"figures"})
-    content["version"] = VERSIONS[any(metric.limit is not None for metric in baseline.figures.values())]
-    lines = [f" {_json(key)}: {_json_block(value)}," for key, value in content.items() if value is not None]
+    has_limits = any(metric.limit is not None for metric in baseline.figures.values())
+    content["version"] = VERSIONS[has_limits or bool(baseline.settings)]
+    lines = [f" {_json(key)}: {_json_block(value)}," for key, value in content.items() if value not in (None, [])]
     figures = [
         f"  {_json(name)}: {_json(baseline.figures[name].model_dump(mode='json', exclude_none=True))}"
         for name in sorted(baseline.figures)

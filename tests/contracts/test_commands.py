@@ -48,8 +48,6 @@ SYNONYMS = (
     ("--field-deg", "--field", "--angle"),
     ("--wavelength-nm", "--wavelength", "--lambda"),
 )
-#: Commands that take a configuration by the name of its file, which a baseline holds: what is set would be in none.
-BY_FILE = {"baseline save", "check"}
 #: Arguments and options that are configurations.
 CONFIGURATIONS = {"config", "tolerances", "sweep"}
 
@@ -168,9 +166,6 @@ def test_no_two_options_are_for_one_thing(name):
 @pytest.mark.parametrize("name", [n for n, c in COMMANDS.items() if CONFIGURATIONS & {p.name for p in c.params}])
 def test_what_takes_a_configuration_takes_set(name):
     settings = options_of(COMMANDS[name]).get("--set")
-    if name in BY_FILE:
-        assert settings is None
-        return
     assert settings.multiple or "list" in annotation_of(COMMANDS[name], settings.name)
     assert settings.metavar == "KEY=VALUE"
 

@@ -123,6 +123,30 @@ def test_the_folder_may_move_and_the_file_is_the_same_bytes(mine, project, tmp_p
     assert again.configuration == "run.yaml"
 
 
+def test_keys_that_are_set_are_those_of_a_file_and_kept(mine, monkeypatch, capsys):
+    """The oracle of `--set` is a configuration file with the same value."""
+    monkeypatch.setattr("pachon.studies.baseline.baseline.OPTICS", {})
+    monkeypatch.setattr("pachon.studies.baseline.baseline.CAMERA", {"height": CAMERA["height"]})
+    (mine / "other.yaml").write_text(yaml.safe_dump(RUN | {"seed": 4}))
+    model, path, kept = str(mine / "telescope.yaml"), str(mine / "heights.json"), str(mine / "kept.json")
+    assert main(["baseline", "save", model, "-o", path, "--config", str(mine / "run.yaml")]) == 0
+    assert "settings" not in json.loads(Path(path).read_text())
+    assert main(["baseline", "save", model, "-o", kept, "--config", str(mine / "run.yaml"), "--set", "seed=4"]) == 0
+    assert (json.loads(Path(kept).read_text())["settings"], read_baseline(kept).settings) == (["seed=4"], ("seed=4",))
+    set_by_key, set_by_file = check_baseline(path, settings=["seed=4"]), check_baseline(path, None, mine / "other.yaml")
+    assert set_by_key.deviations == set_by_file.deviations
+    assert not set_by_key.passed
+    assert check_baseline(kept).passed
+    assert check_baseline(kept, None, mine / "other.yaml").passed
+    # A key that is set again wins over the stored value.
+    assert check_baseline(kept, settings=["seed=3"]).deviations != check_baseline(kept).deviations
+    assert check_baseline(path, settings=["seed=3"]).passed
+    capsys.readouterr()
+    assert main(["check", path, "--set", "seed=4", "--quiet"]) == 1
+    assert main(["check", path, "--set", "sead=4"]) == 2
+    assert "error: --set: unknown key sead = 4: did you mean seed?" in capsys.readouterr().err
+
+
 # --- planted faults ----------------------------------------------------------------------------------------------
 
 WEAKEST = ("Filter_entrance", "Filter_exit", "L3_exit", "M1")
@@ -436,6 +460,8 @@ def test_what_is_no_json_is_one_line(tmp_path, capsys, text, words):
         (["check", "none.json"], "none.json: no such file"),
         (["check", "."], "cannot be read"),
         (["check", "--model", "lsst_v3.3_i"], "expected a FILE"),
+        (["check", "--set", "seed=4"], "expected a FILE"),
+        (["baseline", "save", "lsst_v3.3_r", "-o", "x.json", "--set", "seed=4"], "--set seed=4: expected a config"),
         (["baseline", "save", "lsst_v3.3_r"], "'--out'"),
         (["baseline", "sav", "lsst_v3.3_r"], "'save'"),
         (["baseline", "save", "lsst_v3.3_x", "-o", "x.json"], "lsst_v3.3_x"),
