@@ -9,7 +9,7 @@ import numpy as np
 from bokeh.models import ColumnDataSource, HoverTool, LinearColorMapper, Span, TapTool, Whisker
 from bokeh.palettes import Cividis256
 
-from .pictures import BLUE, GREY, ORANGE, MapPicture, Picture, diverging_palette
+from .pictures import BLUE, DIVERGING, GREY, ORANGE, MapPicture, Picture
 from .result_views import ErrorBarsView, PlacesView, RowsView
 
 
@@ -17,7 +17,7 @@ class RowsPicture(MapPicture):
     """Rows of images, on a signed square-root scale."""
 
     def __init__(self, name: str, title: str, unit: str = "arcsec") -> None:
-        super().__init__(name, title, (f"x [{unit}]", ""), "signed sqrt(image / peak)", diverging_palette())
+        super().__init__(name, title, (f"x [{unit}]", ""), "signed sqrt(image / peak)", DIVERGING)
         self.mapper.update(low=-1.0, high=1.0)
 
     def show(self, view: RowsView) -> None:
@@ -111,8 +111,7 @@ class PlacesPicture(Picture):
         if view.diverging:
             high = max(abs(low), abs(high))
             low = -high
-        palette = diverging_palette() if view.diverging else Cividis256
-        self.mapper.update(palette=palette, low=low, high=high if high > low else low + 1e-6)
+        self.scale(DIVERGING if view.diverging else Cividis256, low, high if high > low else low + 1e-6)
         self.bar.title = view.label
         self.figure.title.text = view.title
         self.source.data = {"x": view.x, "y": view.y, "value": view.value}
