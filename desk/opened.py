@@ -13,6 +13,7 @@ from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError, PachonError
 from ..design.tolerancing.monte_carlo import MonteCarlo
 from ..models.telescope import Telescope
+from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ..sensing.result import DonutFit
 
 if TYPE_CHECKING:
@@ -101,15 +102,18 @@ class Desk:
 
 
 @check_arguments
-def open_desk(source: str | os.PathLike[str] | Telescope | MonteCarlo | DonutFit = "lsst_v3.3_r") -> Desk:
+def open_desk(
+    source: str | os.PathLike[str] | Telescope | MonteCarlo | DonutFit | FocalPlanePsf = "lsst_v3.3_r",
+) -> Desk:
     """Open the live views of a telescope, or of what was computed.
 
     Parameters
     ----------
-    source : str, path, Telescope, MonteCarlo or DonutFit
+    source : str, path, Telescope, MonteCarlo, DonutFit or FocalPlanePsf
         Bundled telescope, its file, a state that a desk saved, the folder of a run, of visits or of tolerances, the
-        store of a sweep, a table of donuts, a telescope, or a result of :func:`~pachon.monte_carlo`,
-        :func:`~pachon.run_tolerances` or :func:`~pachon.fit_donuts`. States of a telescope name its file
+        store of a sweep, a table of donuts, the file of a focal-plane model, a telescope, or a result of
+        :func:`~pachon.monte_carlo`, :func:`~pachon.run_tolerances`, :func:`~pachon.fit_donuts` or
+        :meth:`FocalPlanePsf.fit`. States of a telescope name its file
         ``NAME.yaml``, which :func:`~pachon.save_telescope` writes.
 
     Raises
@@ -135,7 +139,7 @@ def open_desk(source: str | os.PathLike[str] | Telescope | MonteCarlo | DonutFit
     from .sweep_views import SweepBench, is_store
     from .tolerance_views import is_tolerance_folder
 
-    if isinstance(source, MonteCarlo | DonutFit):
+    if isinstance(source, MonteCarlo | DonutFit | FocalPlanePsf):
         return Desk(*result_page(source))
     if not isinstance(source, Telescope):
         path = Path(source)

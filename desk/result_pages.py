@@ -8,17 +8,20 @@ from typing import TYPE_CHECKING
 
 from ..core.errors import ProductError
 from ..design.tolerancing.monte_carlo import MonteCarlo
+from ..reconstruction.focal_plane_psf.file import is_model
+from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ..sensing.result import DonutFit
 
 if TYPE_CHECKING:
     from bokeh.document import Document
 
     from .donut_views import DonutBench
+    from .focal_views import FocalBench
     from .page_session import PageSession
     from .tolerance_views import ToleranceBench
 
 #: Results that have a page.
-DeskResult = MonteCarlo | DonutFit
+DeskResult = MonteCarlo | DonutFit | FocalPlanePsf
 #: Name of a page, and what makes its sessions.
 NamedPage = tuple[str, "Callable[[Document | None], PageSession]"]
 
@@ -29,6 +32,10 @@ def result_page(result: DeskResult) -> NamedPage:
         from .tolerance_views import ToleranceBench
 
         return _tolerance_page(ToleranceBench.of(result))
+    if isinstance(result, FocalPlanePsf):
+        from .focal_views import FocalBench
+
+        return _focal_page(FocalBench("model", result))
     from .donut_views import DonutBench
 
     return _donut_page(DonutBench.of(result))
@@ -61,7 +68,11 @@ def folder_page(folder: Path) -> NamedPage:
 
 
 def table_page(path: Path) -> NamedPage:
-    """Return the page of a table of donuts; ProductError where it is none."""
+    """Return the page of a focal-plane model or a table of donuts; ProductError where it is none."""
+    if is_model(path):
+        from .focal_views import FocalBench
+
+        return _focal_page(FocalBench.read(path))
     from .donut_views import DonutBench
 
     return _donut_page(DonutBench.read(path))
@@ -77,3 +88,9 @@ def _donut_page(bench: DonutBench) -> NamedPage:
     from .donut_session import DonutSession
 
     return bench.name, lambda document: DonutSession(bench, document)
+
+
+def _focal_page(bench: FocalBench) -> NamedPage:
+    from .focal_session import FocalSession
+
+    return bench.name, lambda document: FocalSession(bench, document)
