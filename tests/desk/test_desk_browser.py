@@ -293,7 +293,7 @@ def test_a_box_in_one_plot_of_a_sweep_selects_in_all_and_a_point_opens(browser, 
         number = int(bench.table.number[row])
         chosen = "() => Bokeh.documents[0].get_model_by_name('x1').renderers[0].data_source.selected.indices"
         assert page.evaluate(chosen) == [row]
-        with context.expect_page() as opening:
+        with context.expect_page(timeout=PATIENCE) as opening:
             page.get_by_role("button", name="Open this telescope").click()
         opened = opening.value
         assert opened.url.endswith(f"?point={number}")
