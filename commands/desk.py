@@ -23,8 +23,8 @@ def desk_command(
         names(
             completion.models,
             metavar="MODEL|FILE|FOLDER|SWEEP",
-            help="Bundled telescope, its file, a state that a desk saved (.yaml), a sweep, a table of donuts, or the "
-            "folder of a run, of visits or of tolerances.",
+            help="Bundled telescope, its file, a state that a desk saved (.yaml), a sweep, a table of donuts, a "
+            "focal-plane model, or the folder of a run, of visits or of tolerances.",
             kind=typer.Argument,
         ),
     ] = "lsst_v3.3_r",
@@ -40,7 +40,8 @@ def desk_command(
     Zernikes, images, encircled energy, whiskers and the layout follow. States are undone, compared, saved and loaded.
     The folder of a run shows its stars in place of a telescope: noise-free, observed, model and residuals, CCD by CCD.
     The store of a sweep shows its points: plots with one selection, effects of the parameters, points that open.
-    Folders of pachon tolerance and pachon visits, and tables of pachon donuts, have pages of their own.
+    Folders of pachon tolerance and pachon visits, tables of pachon donuts, and focal-plane models have pages of their
+    own.
     The page is served to this machine alone, at an address with a token, until Ctrl-C. It needs `pachon[desk]`.
 
     **Examples**

@@ -63,7 +63,7 @@ def tolerance_command(
     from ..models.io.bundled import BUNDLED
     from ..models.paraxial import following_stop
     from ..studies.tolerance.file import load_tolerances, with_settings
-    from ..studies.tolerance.product import tolerance_summary, write_tolerances
+    from ..studies.tolerance.product import STORE_FILE, tolerance_summary, write_tolerances
     from ..studies.tolerance.report import verdict
     from ..studies.tolerance.study import run_tolerances
 
@@ -79,7 +79,7 @@ def tolerance_command(
         ) as execution,
         errors_of(tolerances),
     ):
-        study = run_tolerances(telescope, file, folder / "points.tolerance", execution=execution)
+        study = run_tolerances(telescope, file, folder / STORE_FILE, execution=execution)
     write_tolerances(study, file, folder)
     summary = tolerance_summary(study)
     rows = _offender_rows(summary, verdict(summary))

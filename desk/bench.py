@@ -149,16 +149,6 @@ class Bench:
         return sliders
 
     @cached_property
-    def variables(self) -> dict[str, str]:
-        """Addresses of the degrees of freedom that are one parameter of the telescope each, by name."""
-        alone, deformations = {}, {deformation.name for deformation in self.freedoms.deformations}
-        for member in self.freedoms.members:
-            [(address, weight), *others] = member.of.items()
-            if not others and weight == 1.0 and address.rpartition(".")[0] not in deformations:
-                alone[member.name] = address
-        return alone
-
-    @cached_property
     def lifted_names(self) -> tuple[str, ...]:
         """Rafts and CCDs that can be lifted."""
         return () if self.camera is None else (*self.camera.raft_names, *self.camera.ccd_names)

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from scipy.optimize import least_squares
 
-from ..core.errors import check_choice
+from ..core.errors import PachonError, check_choice
 from ..design.images.mtf import mtf
 from ..design.layout.layout import Layout
 from ..design.layout.sections import surface_lines
 from ..design.optimize.jacobian import ParameterColumns
-from ..design.optimize.merit import Beams
-from ..design.optimize.merit_function import SpotSize
-from ..design.optimize.optimize import optimize
+from ..design.optimize.merit import Beams, SpotMerit
 from ..design.optimize.sensitivity import sensitivity
-from ..design.optimize.solver import LeastSquares
-from ..models.parameters.degrees_of_freedom import unit_size
+from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
+from ..models.paraxial import following_stop
+from ..wavefront.chief_rays import reference_rays
 from ..wavefront.request import Request
 from .state import DeskState
 from .views import JMAX, RINGS, Scene
@@ -47,7 +48,7 @@ def mtf_view(scene: Scene) -> MtfView:
 
 @dataclass(frozen=True)
 class SensitivityView:
-    """Derivatives of a metric by all degrees of freedom, at the state, on the flat detector."""
+    """Derivatives of a metric by all degrees of freedom, at the state, on its CCDs."""
 
     metric: str
     value: float  #: of the metric, in its unit
@@ -63,9 +64,15 @@ def sensitivity_view(scene: Scene, metric: str) -> SensitivityView:
     check_choice("metric", metric, METRICS)
     bench = scene.bench
     if metric == SPOTS:
-        unit, (value, derivative) = "um", _spot_slopes(scene)
+        residuals, slopes = _Spots(scene, bench.freedoms).derivatives()
+        radius = float(np.linalg.norm(residuals))
+        unit, value, derivative = "um", 1e6 * radius, 1e6 * (residuals @ slopes) / radius
     else:
-        result = sensitivity(scene.telescope, bench.freedoms, scene.field[None], scene.wavelength, n_zernike=JMAX)
+        detector = scene.telescope.surfaces[-1]
+        # A star sees of its CCD the height alone.
+        shift = detector.matrix @ [0.0, 0.0, float(_heights(scene, scene.field[None])[0])]
+        telescope = scene.telescope.perturbed(detector.name, shift=shift) if shift.any() else scene.telescope
+        result = sensitivity(telescope, bench.freedoms, scene.field[None], scene.wavelength, n_zernike=JMAX)
         zernikes, matrix, unit = 1e9 * result.zernikes[0], 1e9 * result.matrix[0], "nm"
         if metric == WAVEFRONT:
             value = float(np.linalg.norm(zernikes[3:]))
@@ -78,14 +85,30 @@ def sensitivity_view(scene: Scene, metric: str) -> SensitivityView:
     return SensitivityView(metric, value, unit, bench.freedoms.names, bench.freedoms.units, derivative, effect)
 
 
-def _spot_slopes(scene: Scene) -> tuple[float, np.ndarray]:
-    """Return the rms spot radius [um] and its derivatives by the degrees of freedom."""
-    telescope, parameters, matrix = scene.bench.freedoms.parameter_matrix(scene.telescope)
-    beams = Beams.of(telescope, scene.bench.spot_fields, scene.wavelength, n_pupil=RINGS)
-    columns = ParameterColumns.at(telescope, parameters)
-    residuals, slopes = SpotSize().of(telescope, beams).derivatives(columns)
-    radius = float(np.linalg.norm(residuals))
-    return 1e6 * radius, 1e6 * (residuals @ slopes / radius) @ matrix
+def _heights(scene: Scene, fields: np.ndarray) -> np.ndarray:
+    """Return the heights of the CCDs where the chief rays of fields land [m], shape [n]."""
+    plane = scene.focal_plane
+    if plane is None:
+        return np.zeros(len(fields))
+    end = reference_rays(Request.of(scene.telescope, fields, scene.wavelength), scene.wavelength, plane)
+    x, y, _ = scene.telescope.surfaces[-1].to_local(end.position).T
+    return np.asarray(plane.height(x, y))
+
+
+class _Spots:
+    """Spots over the field of the bench, on the CCDs of a scene, by degrees of freedom beyond its state."""
+
+    def __init__(self, scene: Scene, freedoms: DegreesOfFreedom) -> None:
+        telescope, fields = following_stop(scene.telescope), scene.bench.spot_fields
+        self._prepared, self._parameters, self._matrix = freedoms.parameter_matrix(telescope)
+        beams = Beams.of(telescope, fields, scene.wavelength, n_pupil=RINGS)
+        self._merit = SpotMerit(telescope, beams, heights=_heights(scene, fields))
+
+    def derivatives(self, values: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals, whose norm is the rms radius [m], and their derivatives at values of the freedoms."""
+        changes = None if values is None else self._matrix @ values
+        residuals, slopes = self._merit.derivatives(ParameterColumns.at(self._prepared, self._parameters, changes))
+        return residuals, slopes @ self._matrix
 
 
 @dataclass(frozen=True)
@@ -126,25 +149,39 @@ class Improvement:
 
 
 def improved(scene: Scene, names: list[str]) -> Improvement:
-    """Return the state after some steps of :func:`~pachon.optimize` over degrees of freedom of one parameter.
+    """Return the state after some steps of least squares over degrees of freedom, within the ranges of their sliders.
 
-    The merit is the rms spot radius over the field of the bench, on the flat detector.
+    The merit is the rms spot radius over the field of the bench, on the CCDs of the scene.
     """
     bench, state = scene.bench, scene.state
-    addresses = [bench.variables[name] for name in names]
-    result = optimize(
-        scene.telescope,
-        addresses,
-        "spots",
-        bench.spot_fields,
-        scene.wavelength,
-        n_pupil=RINGS,
-        solver=LeastSquares(max_steps=_EVALUATIONS),
+    spots = _Spots(scene, bench.freedoms.select(names))
+    start, slopes = spots.derivatives()
+    before = float(np.linalg.norm(start))
+    controls = {control.key: control for control in bench.controls}
+    chosen = [controls[f"optics.{name}"] for name in names]
+    now = np.array([state.value(control.key) for control in chosen])
+    low = np.minimum([control.low for control in chosen] - now, 0.0)
+    high = np.maximum([control.high for control in chosen] - now, 0.0)
+
+    @lru_cache(maxsize=2)
+    def at(*values: float) -> tuple[np.ndarray, np.ndarray]:
+        try:
+            return spots.derivatives(np.array(values))
+        except PachonError:
+            # The solver takes a shorter step.
+            return np.full_like(start, np.inf), slopes
+
+    # In units of the merit: the tolerances of the solver are relative to 1.
+    solution = least_squares(
+        lambda values: at(*values)[0] / before,
+        np.zeros(len(names)),
+        jac=lambda values: at(*values)[1] / before,
+        bounds=(low, high),
+        x_scale=[control.high for control in chosen],
+        max_nfev=_EVALUATIONS,
     )
-    before, after = (float(merit) for merit in result.merits)
+    after = before * float(np.linalg.norm(solution.fun))
     if after < before:
-        change = dict(zip(result.addresses, result.changes, strict=True))
-        for name, address in zip(names, addresses, strict=True):
-            key, unit = f"optics.{name}", bench.freedoms.units[bench.freedoms.index(name)]
-            state = state.with_value(key, state.value(key) + float(change[address]) / unit_size(unit))
+        for control, value, change in zip(chosen, now, solution.x, strict=True):
+            state = state.with_value(control.key, float(value + change))
     return Improvement(state, 1e6 * before, 1e6 * min(before, after))

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.arguments import check_arguments
-from ..core.errors import ConfigError, DomainError, PachonError
+from ..core.errors import ConfigError, DomainError
 from ..design.tolerancing.monte_carlo import MonteCarlo
 from ..models.telescope import Telescope
+from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ..sensing.result import DonutFit
 
 if TYPE_CHECKING:
@@ -22,12 +23,9 @@ if TYPE_CHECKING:
     from .bench import Bench
     from .page_session import PageSession
     from .state import DeskState
-    from .sweep_views import SweepBench
 
 #: Height of a desk in a notebook [pixels].
 _HEIGHT = 860
-#: Digits of the number of a point, at most.
-_DIGITS = 12
 
 
 class Desk:
@@ -101,15 +99,18 @@ class Desk:
 
 
 @check_arguments
-def open_desk(source: str | os.PathLike[str] | Telescope | MonteCarlo | DonutFit = "lsst_v3.3_r") -> Desk:
+def open_desk(
+    source: str | os.PathLike[str] | Telescope | MonteCarlo | DonutFit | FocalPlanePsf = "lsst_v3.3_r",
+) -> Desk:
     """Open the live views of a telescope, or of what was computed.
 
     Parameters
     ----------
-    source : str, path, Telescope, MonteCarlo or DonutFit
+    source : str, path, Telescope, MonteCarlo, DonutFit or FocalPlanePsf
         Bundled telescope, its file, a state that a desk saved, the folder of a run, of visits or of tolerances, the
-        store of a sweep, a table of donuts, a telescope, or a result of :func:`~pachon.monte_carlo`,
-        :func:`~pachon.run_tolerances` or :func:`~pachon.fit_donuts`. States of a telescope name its file
+        store of a sweep, a table of donuts, the file of a focal-plane model, a telescope, or a result of
+        :func:`~pachon.monte_carlo`, :func:`~pachon.run_tolerances`, :func:`~pachon.fit_donuts` or
+        :meth:`FocalPlanePsf.fit`. States of a telescope name its file
         ``NAME.yaml``, which :func:`~pachon.save_telescope` writes.
 
     Raises
@@ -129,13 +130,13 @@ def open_desk(source: str | os.PathLike[str] | Telescope | MonteCarlo | DonutFit
         raise ConfigError("pachon desk needs Bokeh: pip install 'pachon[desk]'") from None
     from .bench import Bench
     from .donut_views import is_table
-    from .result_pages import folder_page, result_page, table_page
+    from .result_pages import folder_page, points_page, result_page, table_page
     from .session import Session
     from .state import is_state_file
     from .sweep_views import SweepBench, is_store
     from .tolerance_views import is_tolerance_folder
 
-    if isinstance(source, MonteCarlo | DonutFit):
+    if isinstance(source, MonteCarlo | DonutFit | FocalPlanePsf):
         return Desk(*result_page(source))
     if not isinstance(source, Telescope):
         path = Path(source)
@@ -144,8 +145,7 @@ def open_desk(source: str | os.PathLike[str] | Telescope | MonteCarlo | DonutFit
         if is_store(path):
             if is_tolerance_folder(path.parent):
                 return Desk(*folder_page(path.parent))
-            sweep = SweepBench(path)
-            return Desk(sweep.name, lambda document: _sweep_session(sweep, document))
+            return Desk(*points_page(SweepBench(path)))
         if is_table(path):
             return Desk(*table_page(path))
     if isinstance(source, Telescope) or not is_state_file(Path(source)):
@@ -154,25 +154,6 @@ def open_desk(source: str | os.PathLike[str] | Telescope | MonteCarlo | DonutFit
     else:
         bench, state = _loaded(Path(source))
     return Desk(bench.nominal.name, lambda document: Session(bench, state, document))
-
-
-def _sweep_session(sweep: SweepBench, document: Document | None) -> PageSession:
-    """Return the session of a sweep, or of the point that the address of the page asks for."""
-    from .session import Session
-    from .sweep_session import SweepSession
-
-    context = None if document is None else document.session_context
-    request = None if context is None else context.request
-    number = [] if request is None else request.arguments.get("point", [])
-    if not number:
-        return SweepSession(sweep, document)
-    try:
-        bench, state = sweep.opened(int(number[0][:_DIGITS]))
-        return Session(bench, state, document)
-    except PachonError as error:
-        return SweepSession(sweep, document, str(error))
-    except ValueError:
-        return SweepSession(sweep, document, "point: expected a whole number")
 
 
 def _loaded(path: Path) -> tuple[Bench, DeskState]:

@@ -150,7 +150,7 @@ class OptimizePanel(Panel):
         self._scene, self._change, self._defer, self._say = scene, change, defer, say
         self.picture = MeritPicture()
         self.pictures = (self.picture,)
-        names = list(bench.variables)
+        names = list(bench.freedoms.names)
         self.variables = MultiSelect(title="Variables", options=names, value=names[:1], size=_LISTED)
         self.variables.sizing_mode = "stretch_width"
         self.start_button, self.cancel_button = (Button(label=label, width=120) for label in ("Optimise", "Cancel"))

@@ -24,7 +24,8 @@ from .views import HeightsView, ImagesView, OpdView, SectionView, SpotsView, Whi
 
 #: Okabe and Ito's colours, told apart by the colour-blind, of middle brightness: for dark and light pages.
 BLUE, ORANGE, GREEN, GREY = "#2b8cd6", "#e08a1e", "#16a37a", "#8a8f98"
-_DIVERGING = interp_palette(list(RdBu11), 255)
+#: Colours of values about zero.
+DIVERGING = interp_palette(list(RdBu11), 255)
 #: Text, lines and background of pages, by theme.
 THEMES = {
     "light": {"text": "#22262b", "line": "#c9ced6", "page": "#ffffff", "mirror": "#22262b"},
@@ -57,6 +58,8 @@ class Picture:
         self.figure.xaxis.ticker.desired_num_ticks = 5
         self.figure.toolbar.autohide = True
         self.bars: list[ColorBar] = []
+        self.mapper: LinearColorMapper
+        self._palette: Any = None
 
     def add_bar(self, mapper: LinearColorMapper, title: str) -> ColorBar:
         """Add a colour bar with the name and unit of its values."""
@@ -64,6 +67,13 @@ class Picture:
         self.figure.add_layout(bar, "right")
         self.bars.append(bar)
         return bar
+
+    def scale(self, palette: Any, low: float, high: float) -> None:
+        """Set the colours of the mapper, and the values that they go between."""
+        # Bokeh takes milliseconds to check the colours of a palette.
+        if palette is not self._palette:
+            self._palette = self.mapper.palette = palette
+        self.mapper.update(low=low, high=high)
 
     def name_rows(self, places: Sequence[float], names: Iterable[str]) -> None:
         """Put names in the place of numbers at the axis of y."""
@@ -208,7 +218,7 @@ class OpdPicture(MapPicture):
 
     def __init__(self, name: str = "opd", of: str = "") -> None:
         self._title = f"{of}OPD at the star"
-        super().__init__(name, self._title, ("pupil x [m]", "pupil y [m]"), "nm", _DIVERGING)
+        super().__init__(name, self._title, ("pupil x [m]", "pupil y [m]"), "nm", DIVERGING)
 
     def show(self, view: OpdView, beside: OpdView | None = None) -> None:
         """Draw a map; blue is the sign of a longer path. One that stands beside it has the same scale."""
@@ -305,12 +315,11 @@ class WhiskersPicture(Picture):
     ) -> None:
         super().__init__(name, "Whiskers", "detector x [mm]", "detector y [mm]")
         self._extent, self._center, self._of = extent_mm, center_mm, of
-        self._palette: Any = _DIVERGING
         self._heights: HeightsView | None = None
         # Whiskers of many stars on one CCD lie beside their tiles too.
         self._on_tiles = tile_mm > 0.05 * extent_mm
         self.background = BACKGROUNDS[0] if heights else BACKGROUNDS[1]
-        self.mapper = LinearColorMapper(palette=_DIVERGING, low=-1.0, high=1.0, nan_color="rgba(0,0,0,0)")
+        self.mapper = LinearColorMapper(palette=DIVERGING, low=-1.0, high=1.0, nan_color="rgba(0,0,0,0)")
         self._map = ColumnDataSource({"image": [np.zeros((2, 2))], "x": [0.0], "y": [0.0], "w": [1.0], "h": [1.0]})
         self._image = self.figure.image("image", "x", "y", "w", "h", source=self._map, color_mapper=self.mapper)
         self._tiles = ColumnDataSource({"x": [], "y": [], "v": [], "e": [], "fwhm": []})
@@ -322,7 +331,10 @@ class WhiskersPicture(Picture):
         ends = ("x0", "y0", "x1", "y1")
         self.figure.segment(*ends, source=self._compared, color=ORANGE, line_width=2.5, alpha=0.8)
         self._lines = self.figure.segment(*ends, source=self._whiskers, line_width=1.6)
-        self.figure.segment(*ends, source=self._key, color=ORANGE, line_width=3)
+        key = self.figure.segment(*ends, source=self._key, color=ORANGE, line_width=3)
+        for axis in (self.figure.x_range, self.figure.y_range):
+            # The map of heights may cover more CCDs.
+            axis.renderers = [self._rects, key]
         self._key_text = ColumnDataSource({"x": [], "y": [], "text": []})
         self._label = self.figure.text("x", "y", "text", source=self._key_text, text_font_size="11px", y_offset=-4)
         self._bar = self.add_bar(self.mapper, "um")
@@ -363,7 +375,7 @@ class WhiskersPicture(Picture):
         if of_heights and heights is not None:
             seen = np.abs(heights.height_um[np.isfinite(heights.height_um)])
             bound = max(float(np.quantile(seen, 0.99)) if len(seen) else 0.0, 1.0)
-            self._map_to(_DIVERGING, -bound, bound)
+            self.scale(DIVERGING, -bound, bound)
             if heights is not self._heights:
                 self._heights, half = heights, heights.half_mm
                 image = np.float32(heights.height_um)
@@ -373,14 +385,8 @@ class WhiskersPicture(Picture):
             finite = np.concatenate(mapped if beside is not None else mapped[:1])
             finite = finite[np.isfinite(finite)]
             low, high = (float(v) for v in np.quantile(finite, [0.01, 0.99])) if len(finite) else (0.0, 1.0)
-            self._map_to(Cividis256, low, high if high > low else low + 1e-3)
+            self.scale(Cividis256, low, high if high > low else low + 1e-3)
             self._bar.title = "FWHM [arcsec]" if self.background == BACKGROUNDS[1] else "e [%]"
-
-    def _map_to(self, palette: Any, low: float, high: float) -> None:
-        # Bokeh takes milliseconds to check the colours of a palette.
-        if palette is not self._palette:
-            self._palette = self.mapper.palette = palette
-        self.mapper.update(low=low, high=high)
 
     def paint(self, theme: str) -> None:
         """Colour all but the data by a theme; whiskers stand out from the middle of the scale."""
@@ -391,11 +397,6 @@ class WhiskersPicture(Picture):
 
 
 _NO_ENDS: dict[str, Any] = {"x0": [], "y0": [], "x1": [], "y1": []}
-
-
-def diverging_palette() -> list[str]:
-    """Return colours of values about zero."""
-    return list(_DIVERGING)
 
 
 def _curve(radius: np.ndarray, fraction: np.ndarray | None) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -9,15 +10,18 @@ import numpy as np
 from bokeh.models import ColumnDataSource, HoverTool, LinearColorMapper, Span, TapTool, Whisker
 from bokeh.palettes import Cividis256
 
-from .pictures import BLUE, GREY, ORANGE, MapPicture, Picture, diverging_palette
-from .result_views import ErrorBarsView, PlacesView, RowsView
+from .pictures import BLUE, DIVERGING, GREY, ORANGE, MapPicture, Picture
+from .result_views import ErrorBarsView, PlacesView, RowsView, SkyMapView
+
+#: Least width of a degree of right ascension over one of declination in pictures: near the poles it vanishes.
+_LEAST_ASPECT = 0.05
 
 
 class RowsPicture(MapPicture):
     """Rows of images, on a signed square-root scale."""
 
     def __init__(self, name: str, title: str, unit: str = "arcsec") -> None:
-        super().__init__(name, title, (f"x [{unit}]", ""), "signed sqrt(image / peak)", diverging_palette())
+        super().__init__(name, title, (f"x [{unit}]", ""), "signed sqrt(image / peak)", DIVERGING)
         self.mapper.update(low=-1.0, high=1.0)
 
     def show(self, view: RowsView) -> None:
@@ -106,15 +110,46 @@ class PlacesPicture(Picture):
 
     def show(self, view: PlacesView, chosen: int | None = None) -> None:
         """Draw numbers at places; one of them may be framed."""
-        finite = view.value[np.isfinite(view.value)]
-        low, high = (float(v) for v in np.quantile(finite, [0.01, 0.99])) if len(finite) else (0.0, 1.0)
+        low, high = _limits(view.value)
         if view.diverging:
             high = max(abs(low), abs(high))
             low = -high
-        palette = diverging_palette() if view.diverging else Cividis256
-        self.mapper.update(palette=palette, low=low, high=high if high > low else low + 1e-6)
+        self.scale(DIVERGING if view.diverging else Cividis256, low, high)
         self.bar.title = view.label
         self.figure.title.text = view.title
         self.source.data = {"x": view.x, "y": view.y, "value": view.value}
         framed = slice(0, 0) if chosen is None else slice(chosen, chosen + 1)
         self._chosen.data = {"x": view.x[framed], "y": view.y[framed]}
+
+
+class SkyMapPicture(Picture):
+    """Pixels of the sky in colours."""
+
+    def __init__(self, dec_deg: float) -> None:
+        super().__init__("map", "", "right ascension [deg]", "declination [deg]")
+        as_sky(self, dec_deg)
+        self.mapper = LinearColorMapper(palette=Cividis256, low=0.0, high=1.0, nan_color=GREY)
+        self.source = ColumnDataSource({"xs": [], "ys": [], "value": []})
+        color: Any = {"field": "value", "transform": self.mapper}
+        pixels = self.figure.patches("xs", "ys", source=self.source, fill_color=color, line_color=None)
+        self.bar = self.add_bar(self.mapper, "")
+        self.figure.add_tools(HoverTool(renderers=[pixels], tooltips=[("", "@value")]))
+
+    def show(self, view: SkyMapView) -> None:
+        """Draw the pixels."""
+        self.scale(Cividis256, *_limits(view.value))
+        self.bar.title, self.figure.title.text = view.label, view.title
+        self.source.data = {"xs": list(view.ra), "ys": list(view.dec), "value": view.value}
+
+
+def as_sky(picture: Picture, dec_deg: float) -> None:
+    """Turn east to the left, and make angles alike along both axes at a declination."""
+    picture.figure.x_range.flipped = True
+    picture.figure.aspect_scale = max(math.cos(math.radians(dec_deg)), _LEAST_ASPECT)
+
+
+def _limits(values: np.ndarray) -> tuple[float, float]:
+    """Return the values that colours go between: all but the outermost hundredths."""
+    finite = values[np.isfinite(values)]
+    low, high = (float(v) for v in np.quantile(finite, [0.01, 0.99])) if len(finite) else (0.0, 1.0)
+    return low, high if high > low else low + 1e-6

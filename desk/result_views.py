@@ -47,3 +47,14 @@ class ErrorBarsView:
     value: np.ndarray
     error: np.ndarray
     title: str
+
+
+@dataclass(frozen=True)
+class SkyMapView:
+    """A number in pixels of the sky."""
+
+    ra: np.ndarray  #: corners of each pixel [deg], [n, 4]
+    dec: np.ndarray
+    value: np.ndarray  #: [n]
+    label: str  #: of the number, with its unit
+    title: str

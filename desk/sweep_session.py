@@ -13,7 +13,7 @@ from bokeh.transform import dodge
 from ..core.errors import PachonError
 from .page_session import PageSession
 from .pictures import BLUE, GREEN, GREY, ORANGE, Picture
-from .sweep_views import PointsBench, SweepBench, TornadoView
+from .sweep_views import PointsBench, TornadoView
 from .widgets import number_boxes, status_text
 
 #: Parameters with a plot of their own, at most.
@@ -121,7 +121,7 @@ class SweepSession(PageSession):
         self.slice_range = RangeSlider(title="within", start=0.0, end=1.0, value=(0.0, 1.0), step=0.1, visible=False)
         self.slice_range.on_change("value_throttled", lambda attribute, old, new: self.show_slice(*new))
         parts: list[Any] = [self.metric_select, self.other_select, self.slice_select, self.slice_range]
-        if isinstance(self.bench, SweepBench):
+        if self.bench.opens:
             parts += [self.point, self.open]
         self._make_sidebar(*parts)
 

@@ -54,6 +54,8 @@ class PointsBench(ABC):
 
     #: What the points are of, in titles.
     what: ClassVar[str]
+    #: Whether points open as telescopes.
+    opens = True
 
     def __init__(
         self, name: str, number: np.ndarray, parameters: dict[str, np.ndarray], metrics: dict[str, np.ndarray]
@@ -72,6 +74,10 @@ class PointsBench(ABC):
     @abstractmethod
     def tornado(self, metric: str) -> TornadoView:
         """Return the effects of the parameters on a metric."""
+
+    @abstractmethod
+    def opened(self, number: int) -> tuple[Bench, DeskState]:
+        """Return the telescope of a point and its state; PachonError where there is none."""
 
     def in_slice(self, parameter: str, low: float, high: float) -> list[int]:
         """Return the rows of the points whose parameter is within a range, both ends included."""

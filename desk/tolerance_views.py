@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..core.errors import ProductError
+from ..core.errors import DomainError, ProductError
 from ..core.files import parsing, read_bytes
 from ..core.table_files import read_columns
 from ..design.tolerancing.monte_carlo import MonteCarlo
+from ..studies.tolerance.drawn import drawn_telescope
+from ..studies.tolerance.product import STORE_FILE
 from ..studies.tolerance.result import ToleranceStudy
+from .bench import Bench
+from .state import DeskState
 from .sweep_views import PointsBench, TornadoView
 
 #: Files of the folder that ``pachon tolerance`` writes.
@@ -35,6 +40,8 @@ class ToleranceBench(PointsBench):
     ends : dict of str to (float, float)
         Changes of the merit by each tolerance alone at minus and plus its size; without a sensitivity study, NaN and
         the rms contribution.
+    folder : Path, optional
+        Folder of the study, whose draws open as telescopes; a result alone holds no telescope.
     """
 
     what = "tolerances"
@@ -48,6 +55,7 @@ class ToleranceBench(PointsBench):
         ends: dict[str, tuple[float, float]],
         sizes: dict[str, str],
         axis: str,
+        folder: Path | None = None,
     ) -> None:
         compensators = [key for key in columns if key.endswith(_COMPENSATOR)]
         costliest = sorted(ends, key=lambda key: -_size(ends[key]))
@@ -58,6 +66,7 @@ class ToleranceBench(PointsBench):
             {key: columns[key] for key in (merit, *compensators)},
         )
         self._units, self._ends, self._sizes, self._axis = units, ends, sizes, axis
+        self._folder, self.opens = folder, folder is not None
 
     @classmethod
     def of(cls, drawn: MonteCarlo) -> ToleranceBench:
@@ -102,9 +111,22 @@ class ToleranceBench(PointsBench):
             for key, low, high, size, size_unit in zip(*rows, strict=True):
                 ends[str(key)] = (float(low) - nominal, float(high) - nominal)
                 sizes[str(key)] = _text(float(size), str(size_unit))
-        return cls(
-            name, merit, columns, units, ends, sizes, _with_unit(f"change of {merit}, the tolerance alone", unit)
-        )
+        axis = _with_unit(f"change of {merit}, the tolerance alone", unit)
+        return cls(name, merit, columns, units, ends, sizes, axis, folder)
+
+    def opened(self, number: int) -> tuple[Bench, DeskState]:
+        """Return the telescope of a draw, compensators set, and its state; sliders begin at zero there."""
+        count = len(self.number)
+        if self._folder is None or not 0 <= number < count:
+            raise DomainError(f"draw {number}: expected one of the study, 0 to {count - 1}")
+        values = {key.removesuffix(_COMPENSATOR): float(column[number]) for key, column in self.parameters.items()}
+        name = f"{self.name}_draw_{number}"
+        telescope, file = drawn_telescope(self._folder / STORE_FILE, values, name)
+        bench = Bench(telescope)
+        state = bench.start
+        if file.wavelengths_nm:
+            state = replace(state, wavelength_nm=float(np.median(file.wavelengths_nm)))
+        return bench, bench.check(state)
 
     def unit(self, metric: str) -> str:
         """Return the unit of a number."""

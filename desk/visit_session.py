@@ -9,11 +9,12 @@ import numpy as np
 from bokeh.document import Document
 from bokeh.models import HoverTool, Select
 
+from ..core.errors import PachonError
 from .page_session import PageSession
 from .pictures import WhiskersPicture
-from .result_pictures import CorrelationPicture, PlacesPicture
+from .result_pictures import CorrelationPicture, PlacesPicture, SkyMapPicture, as_sky
 from .visit_views import ALL, STACK_KINDS, NightBench, StackBench
-from .widgets import number_boxes
+from .widgets import number_boxes, status_text
 
 
 class NightSession(PageSession):
@@ -24,13 +25,16 @@ class NightSession(PageSession):
         super().__init__(f"{name}: desk of visits", f"{len(bench.visits)} visits in {', '.join(bench.bands)}", document)
         self.bench, self.state = bench, bench.start
         self.sky = PlacesPicture("sky", ("right ascension [deg]", "declination [deg]"), lambda row: None, size=14)
-        # East is to the left, as on the sky.
-        self.sky.figure.x_range.flipped = True
+        as_sky(self.sky, bench.center[1])
+        self.map = SkyMapPicture(bench.center[1])
         self.times = PlacesPicture("times", ("hours since the first visit", ""), self._choose, square=False)
-        self.pictures = (self.sky, self.times)
+        self.pictures = (self.sky, self.times, self.map)
         self._make_widgets()
         self.paint("light")
         self.redraw()
+        self.map.figure.visible = bool(bench.maps)
+        if bench.maps:
+            self.show_map(self.map_select.value)
 
     @property
     def state_words(self) -> str:
@@ -46,7 +50,20 @@ class NightSession(PageSession):
         parts = {"column": self.column, "band": self.band, "visit": self.visit}
         for name, widget in parts.items():
             widget.on_change("value", lambda attribute, old, new, name=name: self.change(**{name: new}))
-        self._make_sidebar(*parts.values())
+        names = list(self.bench.maps)
+        self.map_select = Select(title="Map", value=names[0] if names else "", options=names, visible=bool(names))
+        self.map_select.on_change("value", lambda attribute, old, new: self.show_map(new))
+        self._make_sidebar(*parts.values(), self.map_select)
+
+    def show_map(self, name: str) -> None:
+        """Show another map; one that cannot be read is one line."""
+        self.map.figure.visible = False
+        try:
+            self.map.show(self.bench.map(name))
+            self.map.figure.visible = True
+            status_text(self.status, "")
+        except PachonError as error:
+            status_text(self.status, error)
 
     def _choose(self, row: int) -> None:
         self.visit.value = list(self.bench.shown(self.state))[row]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,14 +15,19 @@ from ..core.units import ARCMIN, ARCSEC
 from ..measure.correlation import Correlation
 from ..studies.night.detector_row import COLUMNS
 from ..studies.night.night import VISITS_FOLDER
+from ..studies.night.sky_pixels import healpix_module
 from ..studies.night.visit_product import VisitProduct
 from ..studies.visits.stack import PsfStack
 from ..studies.visits.stack_metrics import correlations
-from .result_views import PlacesView
+from .result_views import PlacesView, SkyMapView
 from .views import WhiskersView
 
 #: Columns that are no numbers to look at.
 _PLACES = ("visitId", "detector", "band", "ra", "dec", "expMidptMJD")
+#: Pixels of a map that are drawn, at most: finer ones are averaged.
+_MOST_PIXELS = 6000
+#: Beginning of the names of maps, and what stands between their words.
+_MAP, _BETWEEN = "deepCoadd_", "_consolidated_map_"
 #: Choice of all visits, or of all bands.
 ALL = "all"
 
@@ -67,6 +73,11 @@ class NightBench:
             if name not in _PLACES
             and any(np.isfinite(product.detectors[name]).any() for product in self.visits.values())
         )
+        ra, dec = (np.concatenate([v.detectors[name] for v in self.visits.values()]) for name in ("ra", "dec"))
+        #: Middle of all CCDs on the sky, right ascension and declination [deg].
+        self.center = math.degrees(float(np.angle(np.exp(1j * np.deg2rad(ra)).mean()))), float(np.median(dec))
+        #: Files of the maps by quantity and band.
+        self.maps = {_map_name(path): path for path in sorted(folder.glob(f"{_MAP}*{_BETWEEN}*.hsp"))}
 
     @property
     def start(self) -> NightState:
@@ -90,7 +101,32 @@ class NightBench:
             np.concatenate([product.detectors[name] for product in products]) for name in ("ra", "dec", state.column)
         )
         what = f"{len(products)} visits" if state.visit == ALL else f"visit {state.visit}, {products[0].band}"
-        return PlacesView(ra, dec, value, self.label(state.column), f"{state.column} on the sky, {what}")
+        return PlacesView(self._near(ra), dec, value, self.label(state.column), f"{state.column} on the sky, {what}")
+
+    def map(self, name: str) -> SkyMapView:
+        """Return a map; ProductError where it is damaged, ConfigError where the package that reads it is missing."""
+        if name not in self.maps:
+            raise unknown_name("map", name, self.maps)
+        hpgeom, path = healpix_module(), self.maps[name]
+        import healsparse
+
+        with parsing(path, "damaged or no map", ProductError):
+            content = healsparse.HealSparseMap.read(str(path))
+            nside = content.nside_sparse
+            while content.n_valid > _MOST_PIXELS and nside > content.nside_coverage:
+                nside //= 2
+                content = content.degrade(nside)
+            pixels = content.valid_pixels
+            ra, dec = hpgeom.boundaries(nside, pixels, nest=True)
+            unit = str((content.metadata or {}).get("BUNIT", ""))
+            values = np.asarray(content.get_values_pix(pixels), dtype=float)
+        label = f"{name} [{unit}]" if unit else name
+        return SkyMapView(self._near(ra), dec, values, label, f"{name}: {len(pixels)} pixels, nside {nside}")
+
+    def _near(self, ra: np.ndarray) -> np.ndarray:
+        """Return right ascensions [deg] within half a turn of the middle."""
+        middle = self.center[0] % 360.0
+        return middle + (ra - middle + 180.0) % 360.0 - 180.0
 
     def times(self, state: NightState) -> PlacesView:
         """Return the medians of a column over the CCDs of each visit of the band, against hours of the first one."""
@@ -111,6 +147,13 @@ class NightBench:
         if self.failed:
             table["visits that failed"] = (float(self.failed), "")
         return table
+
+
+def _map_name(path: Path) -> str:
+    """Return quantity and band of the file of a map, such as ``psf_size, r``."""
+    quantity, _, ending = path.stem.removeprefix(_MAP).partition(_BETWEEN)
+    reduced, _, band = ending.rpartition("_")
+    return f"{quantity} {reduced}, {band}" if quantity == "epoch" else f"{quantity}, {band}"
 
 
 def is_night(folder: Path) -> bool:

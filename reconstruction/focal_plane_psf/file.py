@@ -34,6 +34,9 @@ from .mosaic import Mosaic, PsfShapes
 from .optics_part import OpticsPart
 from .response import ExposureResponse, Instrument
 
+#: Primary header and that of the first extension [bytes], two blocks of FITS each at most.
+_BEGINNING = 4 * 2880
+
 _Model = TypeVar("_Model", bound="ModelFields")
 
 
@@ -134,6 +137,15 @@ def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
                 hdus.append(_image_hdu(name, np.asarray(values)))
     text = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
     return [_image_hdu("ABOUT", text, "JSON, one character of UTF-8 a pixel"), *hdus]
+
+
+def is_model(path: Path) -> bool:
+    """Return whether a file begins like a focal-plane model."""
+    try:
+        with path.open("rb") as file:
+            return b"EXTNAME = 'ABOUT" in file.read(_BEGINNING)
+    except OSError:
+        return False
 
 
 def read_model(kind: type[_Model], hdus: Iterable[fits.ImageHDU], path: Path) -> _Model:

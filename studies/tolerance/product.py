@@ -15,6 +15,8 @@ from .file import ToleranceFile
 from .report import tolerance_page
 from .result import SHOWN, ToleranceStudy, merit_unit, name_rows, study_title
 
+#: Store of a study in its folder.
+STORE_FILE = "points.tolerance"
 _PERCENT = (50, 80, 90, 95, 98)
 #: Worst offenders in the summary.
 _WORST = 20

@@ -29,7 +29,8 @@ from .result import ToleranceStudy
 
 #: Points that a worker computes at once.
 _BATCH = 25
-_STORE = StoreKind("tolerance study", "pachon tolerance makes", "remove it, and begin again")
+#: Words of messages about stores of tolerance studies.
+STORE = StoreKind("tolerance study", "pachon tolerance makes", "remove it, and begin again")
 
 
 @check_arguments
@@ -137,7 +138,7 @@ def _numbers(
     with ExitStack() as stack:
         store = None
         if path is not None:
-            store = open_store(Path(path), file, lambda: points, resume=execution.resume, kind=_STORE)
+            store = open_store(Path(path), file, lambda: points, resume=execution.resume, kind=STORE)
             stack.enter_context(store)
             for result in store.results():
                 numbers[result.number] = _number(result)

@@ -3,10 +3,12 @@
 import contextlib
 import importlib.util
 import io
+import json
 import re
 import runpy
 import subprocess
 import sys
+import urllib.request
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
@@ -64,6 +66,34 @@ def test_examples_run_and_show_what_they_do(path, tmp_path, monkeypatch):
     title, line, blank, *sentences = introduction.splitlines()
     assert (len(line), blank) == (len(title), "")
     assert len(" ".join(sentences)) > 40
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("stem", sorted(NOTEBOOKS))
+def test_notebooks_of_the_pages_run_and_end_with_a_live_desk(stem, tmp_path):
+    nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
+    for package in ("bokeh", "ipykernel"):
+        pytest.importorskip(package)
+    gallery = pytest.importorskip("sphinx_gallery.notebook", reason="notebooks are made by sphinx-gallery")
+    from sphinx_gallery.gen_gallery import DEFAULT_GALLERY_CONF
+    from sphinx_gallery.py_source_parser import split_code_and_text_blocks
+
+    # The file that the page offers, run in a kernel of its own.
+    _, blocks = split_code_and_text_blocks(str(DOCS / "gallery" / f"{stem}.py"))
+    written = gallery.jupyter_notebook(blocks, dict(DEFAULT_GALLERY_CONF), str(tmp_path))
+    notebook = nbformat.reads(json.dumps(written), as_version=4)
+    client = nbclient.NotebookClient(notebook, timeout=1200, resources={"metadata": {"path": str(tmp_path)}})
+    with client.setup_kernel():
+        for number, cell in enumerate(notebook.cells):
+            client.execute_cell(cell, number)
+        [html] = [o["data"]["text/html"] for o in notebook.cells[-1].outputs if "text/html" in o.get("data", {})]
+        address = re.search(r'<iframe src="(http://127\.0\.0\.1:\d+/[-\w]{32})"', html)[1]
+        # Between the cells the kernel serves the page.
+        page = urllib.request.urlopen(address, timeout=300).read().decode()
+    assert "<title>" in page
+    assert "bokeh" in page.lower()
+    assert [*tmp_path.glob("*.png")]
 
 
 def test_every_public_name_is_in_the_reference_with_its_mark(pages):

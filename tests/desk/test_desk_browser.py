@@ -1,4 +1,4 @@
-"""The desk in a real browser: needs Bokeh, Playwright and Chromium (``apt install chromium``); else it is skipped."""
+"""The desk in a real browser: needs Bokeh, Playwright and its Chromium or the system's; else it is skipped."""
 
 import http.client
 import re
@@ -8,16 +8,17 @@ import subprocess
 import sys
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
 
 pytest.importorskip("bokeh", reason="the desk in a browser needs Bokeh: pip install 'pachon[desk]'")
-playwright = pytest.importorskip("playwright.sync_api", reason="the desk in a browser needs Playwright")
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-if BROWSER is None:
-    pytest.skip("the desk in a browser needs Chromium: apt install chromium", allow_module_level=True)
+playwright = pytest.importorskip(
+    "playwright.sync_api", reason="the desk in a browser needs Playwright: pip install playwright"
+)
 
+from test_desk_focal import fitted  # noqa: E402
 from test_desk_results import donut_table, night_folder, stack_folder, tolerance_folder  # noqa: E402
 from test_desk_sweep import store_of  # noqa: E402
 
@@ -49,7 +50,11 @@ def address():
 @pytest.fixture(scope="module")
 def browser():
     with playwright.sync_playwright() as program:
-        opened = program.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
+        installed = [program.chromium.executable_path, *map(shutil.which, ("chromium", "google-chrome"))]
+        path = next((path for path in installed if path and Path(path).is_file()), None)
+        if path is None:
+            pytest.skip("the desk in a browser needs Chromium: playwright install chromium")
+        opened = program.chromium.launch(executable_path=path, args=["--no-sandbox"])
         yield opened
         opened.close()
 
@@ -225,6 +230,7 @@ def test_pages_of_results_draw_without_errors(browser, tmp_path):
         donut_table(tmp_path / "donuts.ecsv"): 2,
         night_folder(tmp_path / "night"): 2,
         stack_folder(tmp_path / "stacks"): 2,
+        fitted(): 4,
     }
     page, problems, requests = browser.new_page(viewport={"width": 700, "height": 900}), [], []
     page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
@@ -287,7 +293,7 @@ def test_a_box_in_one_plot_of_a_sweep_selects_in_all_and_a_point_opens(browser, 
         number = int(bench.table.number[row])
         chosen = "() => Bokeh.documents[0].get_model_by_name('x1').renderers[0].data_source.selected.indices"
         assert page.evaluate(chosen) == [row]
-        with context.expect_page() as opening:
+        with context.expect_page(timeout=PATIENCE) as opening:
             page.get_by_role("button", name="Open this telescope").click()
         opened = opening.value
         assert opened.url.endswith(f"?point={number}")

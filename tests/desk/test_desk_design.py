@@ -31,8 +31,13 @@ def test_sensitivities_are_differences_of_the_metric(metric):
         assert view.effect[index] == pytest.approx(view.derivative[index] * control.step)
 
 
-def test_sensitivities_begin_at_the_numbers_of_the_desk():
-    scene = Scene.of(BENCH, MOVED)
+#: All rafts 20 um above the detector.
+LIFTED = dict.fromkeys(BENCH.camera.raft_names, 20.0)
+
+
+@pytest.mark.parametrize("lifts", [{}, LIFTED], ids=["flat", "lifted"])
+def test_sensitivities_begin_at_the_numbers_of_the_desk(lifts):
+    scene = Scene.of(BENCH, replace(MOVED, lifts=lifts))
     zernikes = opd_view(scene).zernikes_nm
     # Both fits have the same terms; the rings of the pupil differ.
     assert sensitivity_view(scene, "Z4 at the star").value == pytest.approx(zernikes[0], rel=1e-2)
@@ -66,8 +71,19 @@ def test_an_optimisation_finds_the_misalignment_that_optimize_finds():
         improved(Scene.of(BENCH, MOVED), [])
 
 
-def test_bending_modes_are_no_variables():
-    assert set(BENCH.variables) == {f"{b}_{m}" for b in ("M2", "Camera") for m in ("dx", "dy", "dz", "rx", "ry")}
+@pytest.mark.long
+def test_an_optimisation_finds_bending_modes_and_the_heights_of_ccds():
+    # Both are planted: the modes in the state, and CCDs that stand on one height.
+    bent = replace(
+        BENCH.start, optics={"M1M3_B2": 0.2, "M2_B5": 0.1}, lifts=dict.fromkeys(BENCH.camera.raft_names, 20.0)
+    )
+    state = improved(Scene.of(BENCH, bent), ["M1M3_B2", "M2_B5", "Camera_dz"]).state
+    flat = improved(Scene.of(BENCH, replace(bent, lifts={})), ["M1M3_B2", "M2_B5", "Camera_dz"]).state
+    # CCDs 20 um above the detector are in focus where the camera is as much lower.
+    assert state.optics["Camera_dz"] - flat.optics["Camera_dz"] == pytest.approx(-20.0, abs=0.5)
+    designed = improved(Scene.of(BENCH, BENCH.start), ["M1M3_B2", "M2_B5", "Camera_dz"]).state
+    for name in ("M1M3_B2", "M2_B5"):
+        assert flat.optics[name] == pytest.approx(designed.optics[name], abs=2e-3)
 
 
 def test_a_view_in_space_has_its_axes():

@@ -9,13 +9,16 @@ from astropy import units as u
 from astropy.table import QTable
 
 import pachon
-from pachon.core.errors import ProductError
+from pachon.core.errors import DomainError, ProductError
 from pachon.core.products import Stamp
 from pachon.desk.donut_views import DonutBench, DonutStamps
 from pachon.desk.tolerance_views import ToleranceBench
 from pachon.desk.visit_views import STACK_KINDS, NightBench, StackBench
 from pachon.studies.night.detector_row import COLUMNS
 from pachon.studies.night.visit_product import VisitProduct, product_name
+from pachon.studies.tolerance.file import ToleranceFile
+from pachon.studies.tolerance.product import write_tolerances
+from pachon.studies.tolerance.study import run_tolerances
 from pachon.studies.visits.stack import PsfStack
 
 STAMP = Stamp("0" * 64, 1)
@@ -190,13 +193,42 @@ def test_what_has_no_page_is_one_line(tmp_path):
         pachon.open_desk(broken)
 
 
+def test_maps_of_a_night_are_the_pixels_of_its_files(tmp_path):
+    healsparse = pytest.importorskip("healsparse", reason="maps need healsparse: pip install 'pachon[healpix]'")
+    hpgeom = pytest.importorskip("hpgeom")
+    folder = night_folder(tmp_path / "night")
+    name = "deepCoadd_psf_size_consolidated_map_weighted_mean_r.hsp"
+    pixels = hpgeom.query_circle(512, 359.9, 1.0, 2.0, nest=True)
+    written = healsparse.HealSparseMap.make_empty(32, 512, dtype=np.float64)
+    written.update_values_pix(pixels, np.linspace(2.0, 3.0, len(pixels)))
+    written.metadata = {"BUNIT": "pixel"}
+    written.write(str(folder / name), nocompress=True)
+    bench = NightBench(folder)
+    assert list(bench.maps) == ["psf_size, r"]
+    view = bench.map("psf_size, r")
+    assert view.label == "psf_size, r [pixel]"
+    np.testing.assert_array_equal(view.value, np.linspace(2.0, 3.0, len(pixels)))
+    # Corners are beside the centres, on the side of the sky where the visits are (ra of 1 to 5 deg).
+    ra, dec = hpgeom.pixel_to_angle(512, np.sort(pixels), nest=True)
+    away = np.hypot((view.ra.mean(axis=1) - ra + 180.0) % 360.0 - 180.0, view.dec.mean(axis=1) - dec)
+    assert away.max() < 1e-3
+    assert np.abs(view.ra).max() < 5.0
+    # Of many pixels four are averaged, and again.
+    written.update_values_pix(hpgeom.query_circle(512, 3.0, 1.0, 10.0, nest=True), 4.0)
+    written.write(str(folder / name), nocompress=True, clobber=True)
+    assert len(bench.map("psf_size, r").value) < 6000
+    (folder / name).write_bytes(b"SIMPLE")
+    with pytest.raises(ProductError, match="damaged or no map"):
+        bench.map("psf_size, r")
+
+
 @pytest.mark.long
 def test_every_page_is_made_without_a_browser(tmp_path, drawn):
     pytest.importorskip("bokeh", reason="a desk needs Bokeh: pip install 'pachon[desk]'")
     pages = {
         tolerance_folder(tmp_path / "tolerance"): {"x0", "other", "tornado"},
         donut_table(tmp_path / "donuts.ecsv"): {"field", "zernikes", "stamps"},
-        night_folder(tmp_path / "night"): {"sky", "times"},
+        night_folder(tmp_path / "night"): {"sky", "times", "map"},
         stack_folder(tmp_path / "stacks"): {"whiskers", "xi"},
     }
     for source, pictures in pages.items():
@@ -233,3 +265,35 @@ def test_clicks_and_choices_change_what_is_shown(tmp_path, drawn):
     assert "no point has such a value" in points.status.text
     points.slice_select.value = points.slice_select.options[0]
     assert points.source.selected.indices == []
+
+
+@pytest.mark.long
+def test_a_drawn_telescope_opens_with_the_merit_of_its_draw(tmp_path):
+    lens = tmp_path / "lens.yaml"
+    pachon.save_telescope(pachon.new_telescope("triplet"), lens)
+    content = {
+        "telescope": str(lens),
+        "fields_deg": [[0.0, 0.0], [0.0, 8.0]],
+        "rings": 2,
+        # A decentre, a glass, and the shape of a surface, which has no slider.
+        "tolerances": [
+            {"name": "L2.dy_um", "size": 20},
+            {"name": "S1.n", "size": 1e-3},
+            {"name": "S1.irregularity_nm", "size": 60, "zernikes": [5, 6]},
+        ],
+        "compensators": ["Detector.dz_um"],
+        "draws": 4,
+    }
+    file = ToleranceFile.model_validate(content)
+    study = run_tolerances(pachon.load_telescope(lens), file, tmp_path / "points.tolerance")
+    write_tolerances(study, file, tmp_path)
+    bench = ToleranceBench.read(tmp_path)
+    opened, state = bench.opened(3)
+    assert opened.nominal.name == f"{study.telescope}_draw_3"
+    radii = pachon.spots(opened.telescope(state), np.deg2rad(content["fields_deg"]), n_pupil=2).rms_radius
+    assert np.sqrt(np.mean(radii**2)) == pytest.approx(study.merit[3], rel=1e-9)
+    with pytest.raises(DomainError, match=r"^draw 4: expected one of the study, 0 to 3$"):
+        bench.opened(4)
+    lens.write_text(lens.read_text().replace("triplet", "other", 1))
+    with pytest.raises(ProductError, match="has changed since"):
+        bench.opened(3)

@@ -1,0 +1,138 @@
+"""The PSF model of a focal plane, and views of it; nothing here draws."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from ..core.errors import DomainError
+from ..core.statistics import FWHM_PER_RMS, finite_median
+from ..core.units import ARCSEC
+from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
+from ..reconstruction.focal_plane_psf.mosaic import PsfShapes
+from .result_views import PlacesView, RowsView
+from .views import HeightsView, WhiskersView, heights_view
+
+#: Places of a map in all, about: one a CCD of a large camera.
+_PLACES = 300
+#: Distance of the outermost places from the centre of a CCD, in halves of its side.
+_INSIDE = 0.9
+#: What the map shows.
+MAPS = ("uncertainty of e", "uncertainty of FWHM", "e", "FWHM")
+
+
+class FocalBench:
+    """A focal-plane model at a grid of places on the CCDs that have stars.
+
+    Parameters
+    ----------
+    name : str
+        Name of the model.
+    model : FocalPlanePsf
+        The model.
+    """
+
+    def __init__(self, name: str, model: FocalPlanePsf) -> None:
+        self.name, self.model = name, model
+        ccds = np.unique(model.field.data.places.ccd)
+        side = max(1, round(math.sqrt(_PLACES / len(ccds))))
+        axis = _INSIDE * (2.0 * (np.arange(side) + 0.5) / side - 1.0)
+        grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+        #: Number of the CCD of each place, and its position on the detector [m], shapes [n] and [n, 2].
+        self.ccd, uv = np.repeat(ccds, len(grid)), np.tile(grid, (len(ccds), 1))
+        mosaic, camera = model.mosaic, model.mosaic.camera
+        self.places = (
+            mosaic.centers[self.ccd] + mosaic.half_size * uv if camera is None else camera.from_uv(self.ccd, uv)
+        )
+        half = mosaic.half_size if camera is None else float(camera.half_sizes.max())
+        #: Side of the square that a place stands for, and half that of all [m].
+        self.spacing = 2.0 * half * _INSIDE / side
+        low, high = self.places.min(axis=0), self.places.max(axis=0)
+        self.center, self.reach = 0.5 * (low + high), 0.5 * float((high - low).max()) + half / side
+
+    @classmethod
+    def read(cls, path: Path) -> FocalBench:
+        """Read a model; ProductError where it is none."""
+        return cls(path.stem, FocalPlanePsf.read(path))
+
+    def __len__(self) -> int:
+        return len(self.ccd)
+
+    def ccd_name(self, place: int) -> str:
+        """Return the name of the CCD of a place."""
+        return self.model.mosaic.names[self.ccd[place]]
+
+    @cached_property
+    def predicted(self) -> tuple[PsfShapes, PsfShapes]:
+        """Shapes at the places, and their standard deviations."""
+        names = self.model.mosaic.names
+        return self.model.predict([names[i] for i in self.ccd], *self.places.T)
+
+    def whiskers(self) -> WhiskersView:
+        """Return the predicted shapes, weighted moments, at all places."""
+        shapes, _ = self.predicted
+        x_mm, y_mm = 1e3 * self.places.T
+        fwhm = FWHM_PER_RMS * shapes.size / ARCSEC
+        return WhiskersView(x_mm, y_mm, shapes.e1, shapes.e2, fwhm, f"Predicted shapes at {len(self)} places")
+
+    def heights(self) -> HeightsView | None:
+        """Return the fitted heights of the CCDs; None without a telescope."""
+        return None if self.model.heights is None else heights_view(self.model.heights)
+
+    def map(self, name: str) -> PlacesView:
+        """Return one of :data:`MAPS` at all places; the uncertainty of e is that of a component, rms of both."""
+        shapes, sigma = self.predicted
+        values, unit = {
+            "e": (100.0 * np.hypot(shapes.e1, shapes.e2), "%"),
+            "FWHM": (FWHM_PER_RMS * shapes.size / ARCSEC, "arcsec"),
+            "uncertainty of e": (100.0 * np.sqrt(0.5 * (sigma.e1**2 + sigma.e2**2)), "%"),
+            "uncertainty of FWHM": (FWHM_PER_RMS * sigma.size / ARCSEC, "arcsec"),
+        }[name]
+        x_mm, y_mm = 1e3 * self.places.T
+        return PlacesView(x_mm, y_mm, values, f"{name} [{unit}]", f"{name[0].upper()}{name[1:]} of the prediction")
+
+    def psf(self, place: int) -> RowsView | None:
+        """Return the PSF at a place and its standard deviation over its peak; None where none can be drawn."""
+        where = self.ccd_name(place), *self.places[place]
+        try:
+            image, sigma = self.model.draw(*where)[0], self.model.draw_uncertainty(*where)[0]
+        except DomainError:
+            # A model without telescope of stars without stamps.
+            return None
+        rows = {"PSF": image[None] / image.max(), "sigma": sigma[None] / image.max()}
+        return RowsView(rows, len(image) * self._pixel_arcsec, f"PSF on {where[0]}, and its uncertainty")
+
+    def components(self) -> RowsView | None:
+        """Return the mean star and the eigen-PSFs of the residual stamps, each over its peak; None without stamps."""
+        mean, pca = self.model.mean_star, self.model.pca
+        if mean is None:
+            return None
+        images = mean[None] if pca is None else np.stack([mean, *pca.components])
+        row = images / np.abs(images).max(axis=(1, 2), keepdims=True)
+        title = "Mean star" + ("" if pca is None else f" and {len(pca.components)} eigen-PSFs of the residual stamps")
+        return RowsView({"": row}, len(mean) * self._pixel_arcsec, title)
+
+    @property
+    def _pixel_arcsec(self) -> float:
+        """Angle of a pixel of drawn images [arcsec]; NaN where none can be drawn."""
+        optics = self.model.field.optics
+        scale = self.model.pixel_scale if optics is None else optics.pixel_scale
+        return math.nan if scale is None else scale / ARCSEC
+
+    def numbers(self, place: int) -> dict[str, tuple[float, str]]:
+        """Return the numbers of the model and of a place, with their units."""
+        shapes, sigma = self.predicted
+        size = FWHM_PER_RMS / ARCSEC
+        e = 100.0 * np.hypot(shapes.e1, shapes.e2)
+        return {
+            "stars of the fit": (float(self.model.used.sum()), ""),
+            "e, median": (finite_median(e), "%"),
+            "FWHM, median": (finite_median(size * shapes.size), "arcsec"),
+            **{f"chi-square of {name}": (value, "") for name, value in self.model.chi2.items()},
+            "e1 at the place": (100.0 * float(shapes.e1[place]), f"± {100.0 * sigma.e1[place]:.2g} %"),
+            "e2 at the place": (100.0 * float(shapes.e2[place]), f"± {100.0 * sigma.e2[place]:.2g} %"),
+            "FWHM at the place": (size * float(shapes.size[place]), f"± {size * sigma.size[place]:.2g} arcsec"),
+        }
