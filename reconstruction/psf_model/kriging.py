@@ -318,13 +318,16 @@ def _noise_correlations(
     pixels = pixels / np.maximum(RMS_PER_MAD * row_medians(np.abs(pixels[:, sky])), np.finfo(float).tiny)[:, None, None]
     # Cosmic rays and neighbours would correlate.
     used = (np.abs(pixels) < _CLIP) & sky & (True if masked is None else ~masked)
-    pixels = np.where(used, pixels, 0.0)
-    square = (pixels**2).sum() / max(used.sum(), 1)
+    # In rows with so many dark pixels behind them that no lag leads into the light of another one.
+    room = ((0, 0), (0, max(dy for dy, _ in _LAGS)), (0, max(dx for _, dx in _LAGS)))
+    flags = np.pad(used.astype(np.float64), room)
+    flags, light = flags.ravel(), np.pad(np.where(used, pixels, 0.0), room).ravel()
+    square = (light @ light) / max(used.sum(), 1)
     correlations = {}
     for dy, dx in _LAGS if square > 0.0 else ():
-        first, second = _lagged(ny, nx, dy, dx)
-        count = max((used[:, *first] & used[:, *second]).sum(), 1)
-        correlation = float((pixels[:, *first] * pixels[:, *second]).sum() / (count * square))
+        shift = dy * (nx + room[2][1]) + dx
+        count = max(flags[:-shift] @ flags[shift:], 1.0)
+        correlation = float((light[:-shift] @ light[shift:]) / (count * square))
         if abs(correlation) > _SIGNIFICANT / math.sqrt(count):
             correlations[dy, dx] = correlation
     return correlations
