@@ -136,9 +136,7 @@ class Contrasts:
             return 0.0
         squares = (self.axes.T @ values) ** 2
         factors = np.concatenate([[0.0], _FACTORS])
-        log_powers, log_variances = log_powers_and_variances(
-            squares, self.variances / mean_variance, relative, factors
-        )
+        log_powers, log_variances = log_powers_and_variances(squares, self.variances / mean_variance, relative, factors)
         evidence = -0.5 * (log_variances + len(squares) * log_powers)
         best = int(np.argmax(evidence))
         return float(factors[best]) / mean_variance if evidence[best] > evidence[0] + _LEAST_EVIDENCE else 0.0
