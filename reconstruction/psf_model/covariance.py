@@ -27,7 +27,7 @@ from functools import lru_cache
 import numpy as np
 import scipy.linalg
 
-from .pixel_sums import sums_of_products
+from ...core.row_sums import sums_of_products
 
 #: Fewest columns of a kernel: variance and length of the process, noise that all stars have, variances of the
 #: trend's terms of degree 1 and 2, and so on to its order. Lengths where the extent is 2 wide. A last column holds the

@@ -14,12 +14,12 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 
 from ...core.errors import ConfigError, PachonError, attempt
+from ...core.row_sums import sums_of_products
 from ...core.threads import one_blas_thread
 from .basis import FittedBasis
 from .checks import check_distinct_positions, check_terms
 from .colour import FittedColour, StarColours
 from .file_parts import ModelParts
-from .pixel_sums import sums_of_products
 from .polynomial import MOST_ORDER, Extent, automatic_orders, design_matrix
 
 # Order of the polynomials that predict outliers and masked pixels where the interpolation has none of its own.

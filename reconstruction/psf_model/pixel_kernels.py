@@ -5,35 +5,16 @@ from __future__ import annotations
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
+from ...core.row_sum_kernels import LANES, columns
 
 wp.set_module_options(FORWARD_OPTIONS)
 
-#: Columns of one packet.
-LANES = 32
 #: Axes whose variances are multiplied before a logarithm is taken: each is at most 4^12 times 300 stars, so that the
 #: product stays below 1e100.
 TOGETHER = wp.constant(10)
 #: Bounds of products of lanes.
 HIGH = wp.constant(wp.float64(1e150))
 LOW = wp.constant(wp.float64(1e-150))
-columns = wp.types.vector(LANES, wp.float64)
-
-
-@wp.kernel
-def add_products(
-    first: wp.int32,
-    weights: wp.array2d(dtype=wp.float64),
-    rows: wp.array2d(dtype=columns),
-    sums: wp.array2d(dtype=columns),
-):
-    """Add up weights [position, row] times rows [packet, row] of one packet at all positions, row after row."""
-    packet = first + wp.tid()
-    for position in range(weights.shape[0]):
-        total = columns()
-        for row in range(rows.shape[1]):
-            product = rows[packet, row] * weights[position, row]
-            total = total + product
-        sums[position, packet] = total
 
 
 @wp.func

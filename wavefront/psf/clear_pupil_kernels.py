@@ -60,10 +60,28 @@ def within(a: wp.float64, b: wp.float64, c: wp.float64, square: wp.float64):
 
 
 @wp.kernel
-def find_edges(
+def square_distances(
     first: wp.int32,
     surfaces: PackedSurfaces,
     position: wp.array3d(dtype=wp.float64),
+    squares: wp.array3d(dtype=wp.float64),
+):
+    """Square the distances of the rays of one star from the centres of clear apertures.
+
+    Arguments: position [surface, 3, star * n_ray + ray]: telescope frame [m]; squares [star, surface, ray] [m^2].
+    """
+    star = first + wp.tid()
+    for s in range(surfaces.kinds.shape[0]):
+        if surfaces.kinds[s, STOPPED] == 1:
+            for ray in range(squares.shape[2]):
+                squares[star, s, ray] = squared_distance(surfaces, s, position, star * squares.shape[2] + ray)
+
+
+@wp.kernel
+def find_edges(
+    first: wp.int32,
+    surfaces: PackedSurfaces,
+    squares: wp.array3d(dtype=wp.float64),
     radius: wp.array(dtype=wp.float64),
     n_spoke: wp.int32,
     edges: wp.array3d(dtype=wp.float64),
@@ -73,22 +91,21 @@ def find_edges(
     The intersection of a ray with a surface is nearly linear in its place in the pupil. So the square of its distance
     from the centre of the aperture is a parabola along the spoke: three rays determine its intersection with the rim.
 
-    Arguments: position [surface, 3, (star * 3 + ring) * n_spoke + spoke]: telescope frame [m]; radius [3] of the rays
-    in the pupil, at equal steps [m]; edges [star, spoke, 2]: inner and outer radius, the same where all is dark.
+    Arguments: squares [star, surface, ring * n_spoke + spoke]: those of :func:`square_distances`; radius [3] of the
+    rays in the pupil, at equal steps [m]; edges [star, spoke, 2]: inner and outer radius, the same where all is dark.
     """
     item = first + wp.tid()
     star = item // n_spoke
     spoke = item % n_spoke
-    ray = 3 * star * n_spoke + spoke
     half = wp.float64(0.5)
     step = radius[1] - radius[0]
     inside = radius[0]
     outside = radius[2]
     for s in range(surfaces.kinds.shape[0]):
         if surfaces.kinds[s, STOPPED] == 1:
-            a = squared_distance(surfaces, s, position, ray)
-            b = squared_distance(surfaces, s, position, ray + n_spoke)
-            c = squared_distance(surfaces, s, position, ray + 2 * n_spoke)
+            a = squares[star, s, spoke]
+            b = squares[star, s, spoke + n_spoke]
+            c = squares[star, s, spoke + 2 * n_spoke]
             missed = a != a or b != b or c != c
             rim = surfaces.numbers[s, APERTURE + 3] * surfaces.numbers[s, APERTURE + 3]
             low, high = within(a, b, c, rim)

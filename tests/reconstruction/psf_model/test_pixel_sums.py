@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from pachon.reconstruction.psf_model.pixel_sums import log_powers_and_variances, sums_of_products
+from pachon.core.row_sums import sums_of_products
+from pachon.reconstruction.psf_model.pixel_sums import log_powers_and_variances
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (3, 40, 32), (60, 41, 961), (7, 0, 5), (0, 4, 5)])
