@@ -12,6 +12,7 @@ from ...core.launch import launch
 from ...core.units import require_count
 from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
+from ...raytrace.kernels.surface_table import STOPPED
 from ...raytrace.launch import launch_bundles
 from ...raytrace.pack.surfaces import clear_annulus, pack_surfaces
 from ...raytrace.trace import trace_packets
@@ -21,8 +22,8 @@ from .clear_pupil_kernels import find_edges, square_distances
 _SPOKES_PER_RING = 3.2
 #: Most rings; more, of polynomials of a higher degree, add nothing.
 MOST_RINGS = 12
-# Rays on a spoke that determine the rims of apertures, by parabolas.
-_EDGE_RINGS = 3
+#: Rays on a spoke that determine the rims of apertures, by parabolas.
+EDGE_RINGS = 3
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class SpokePupil:
     fraction: np.ndarray  #: of the pupil's area within each ring, [n_ring]
     quadrature: np.ndarray  #: weights of the rings, of sum 1, [n_ring]
     unit: np.ndarray  #: directions of the spokes, [n_spoke, 2]
+    count: int  #: number of points that was wanted
 
     @classmethod
     def fill(cls, diameter: float, obscuration: float, count: int) -> SpokePupil:
@@ -54,6 +56,7 @@ class SpokePupil:
             fraction=fraction,
             quadrature=1.0 / (n_ring * (n_ring - 1) * legendre(node) ** 2),
             unit=np.stack([np.cos(angle), np.sin(angle)], axis=-1),
+            count=count,
         )
 
     @property
@@ -89,20 +92,22 @@ def clear_edges(
 def aperture_distances(
     telescope: Telescope, direction: np.ndarray, unit: np.ndarray, wavelength: float, threads: int | None = None
 ) -> np.ndarray:
-    """Return squared distances of rays from the centres of clear apertures [m^2], [n_star, n_surface, 3 n_spoke].
+    """Return squared distances of rays from the centres of clear apertures [m^2], [n_star, n_stop, 3 n_spoke].
 
-    The rays are those of :func:`clear_edges`, ring by ring; those of surfaces that stop no light are 0.
+    The rays are those of :func:`clear_edges`, ring by ring, the apertures those of :func:`stopping_surfaces`.
     """
     points = (_edge_radius(telescope)[:, None, None] * unit).reshape(-1, 2)
     n_surface = len(telescope.surfaces)
     rays = launch_bundles(telescope, direction, wavelength, points)
     places = trace_packets(telescope, rays, n_surface, threads=threads).end.position
-    squares = np.zeros((len(direction), n_surface, len(points)))
+    stops = stopping_surfaces(telescope)
+    squares = np.empty((len(direction), len(stops), len(points)))
     launch(
         square_distances,
         len(direction),
         [
             pack_surfaces(telescope),
+            warp_array(stops, wp.int32),
             warp_array(places.numpy().reshape(n_surface, 3, -1), wp.float64),
             warp_array(squares, wp.float64),
         ],
@@ -119,6 +124,7 @@ def edges_of(telescope: Telescope, squares: np.ndarray, n_spoke: int, threads: i
         len(squares) * n_spoke,
         [
             pack_surfaces(telescope),
+            warp_array(stopping_surfaces(telescope), wp.int32),
             warp_array(squares, wp.float64),
             warp_array(_edge_radius(telescope), wp.float64),
             n_spoke,
@@ -129,10 +135,15 @@ def edges_of(telescope: Telescope, squares: np.ndarray, n_spoke: int, threads: i
     return edges
 
 
+def stopping_surfaces(telescope: Telescope) -> np.ndarray:
+    """Return the indices of surfaces that stop light by a disc or ring."""
+    return np.flatnonzero(pack_surfaces(telescope).kinds.numpy()[:, STOPPED] == 1)
+
+
 def _edge_radius(telescope: Telescope) -> np.ndarray:
     """Return the radii in the pupil of rays that determine the rims [m]."""
     outer = 0.5 * telescope.pupil_diameter
-    return np.linspace(telescope.pupil_obscuration * outer, outer, _EDGE_RINGS)
+    return np.linspace(telescope.pupil_obscuration * outer, outer, EDGE_RINGS)
 
 
 def has_only_annuli(telescope: Telescope) -> bool:
