@@ -6,12 +6,14 @@ Errors of values are ValueErrors too, those of names KeyErrors: code that catche
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from reprlib import Repr
-from typing import Any, Self
+from typing import Any, ParamSpec, Self, TypeVar
 
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 #: Longest text of a value in a message [characters].
 _MAX_VALUE = 80
 #: Longest text of a path in a message [characters].
@@ -158,6 +160,16 @@ def shown(value: object) -> str:
 def cut_short(text: str, length: int = 60) -> str:
     """Return a text of at most `length` characters."""
     return text if len(text) <= length else text[: length - 3] + "..."
+
+
+def attempt(
+    function: Callable[_Arguments, _Result], *arguments: _Arguments.args, **options: _Arguments.kwargs
+) -> _Result | PachonError:
+    """Return what a function returns, or the PachonError that it raises."""
+    try:
+        return function(*arguments, **options)
+    except PachonError as error:
+        return error
 
 
 @contextmanager

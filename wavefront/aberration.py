@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.random_streams import stream
+from ..core.row_sums import sums_of_products
 from ..core.units import metres, plane_points, radians, require_seed
 from ..models.telescope import Telescope
 from ..models.zernike_polynomials import annular_zernike_gradients, annular_zernikes, noll_to_nm
@@ -204,8 +205,6 @@ class StarWavefronts(ResidualWavefront):
 
 def _sum_of_terms(coefficients: np.ndarray, basis: np.ndarray) -> np.ndarray:
     """Sum terms in a fixed order, so that the bytes of a star do not depend on its neighbours."""
-    total = np.zeros(coefficients.shape[:-1] + basis.shape[1:])
-    extra = (np.newaxis,) * (basis.ndim - 1)
-    for j, term in enumerate(basis):
-        total += coefficients[(..., j, *extra)] * term
-    return total
+    count = len(basis)
+    total = sums_of_products(coefficients.reshape(-1, count), basis.reshape(count, -1))
+    return total.reshape(coefficients.shape[:-1] + basis.shape[1:])

@@ -6,6 +6,7 @@ paths. The kernel returns these few numbers, so that memory does not hold the ra
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +28,9 @@ from .chief_rays import image_jacobians, reference_rays
 from .pupil_sampling import CHIEF_RAY
 from .reference_sphere import path_to_sphere
 from .request import Request
+
+# Attributes of each star.
+_OF_STARS = ("displacement", "path", "lit", "jacobian", "reference_points", "reference_cosines", "fields")
 
 
 @dataclass(frozen=True)
@@ -55,8 +59,13 @@ class PupilOptics:
 
     def stars(self, index: slice | np.ndarray) -> PupilOptics:
         """Return the optics of some of the stars."""
-        names = ("displacement", "path", "lit", "jacobian", "reference_points", "reference_cosines", "fields")
-        return replace(self, **{name: getattr(self, name)[index] for name in names})
+        return replace(self, **{name: getattr(self, name)[index] for name in _OF_STARS})
+
+    @classmethod
+    def together(cls, parts: Sequence[PupilOptics]) -> PupilOptics:
+        """Return the optics of the stars of all parts, of one pupil and the same wavelengths."""
+        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _OF_STARS}
+        return replace(parts[0], **arrays)
 
     @property
     def exit_cosines(self) -> np.ndarray:

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-from ...core.errors import DomainError, PachonError, ProductError
+from ...core.errors import DomainError, PachonError, ProductError, attempt
 from ...core.progress import Reporter
 from ...core.threads import thread_count
 from ..experiment import Experiment
@@ -23,6 +23,16 @@ _T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
+class ModelTogether(Generic[_T]):
+    """A reduction of the CCDs that are exposed together, for :func:`simulate_ccds`.
+
+    It returns their results in order, with the error of a CCD in its place; none may depend on the other CCDs.
+    """
+
+    reduce: Callable[[Sequence[CcdExposure]], Sequence[_T | PachonError]]
+
+
+@dataclass(frozen=True)
 class SimulatedCcds(Generic[_T]):
     """Results of :func:`simulate_ccds`, in the order of the CCDs."""
 
@@ -32,7 +42,7 @@ class SimulatedCcds(Generic[_T]):
 
 def simulate_ccds(
     experiment: Experiment,
-    model: Callable[[CcdExposure], _T],
+    model: Callable[[CcdExposure], _T] | ModelTogether[_T],
     names: Sequence[str] | None = None,
     *,
     fields: Mapping[str, StarField] | None = None,
@@ -44,11 +54,11 @@ def simulate_ccds(
 ) -> SimulatedCcds[_T]:
     """Expose CCDs, a few at a time, and model them beside the next exposures.
 
-    `model` is any reduction of an exposure, such as :func:`~.model_ccd`. It runs on a thread of its own, one CCD at a
-    time, in the order of the CCDs; no byte depends on the number of threads. `names` are by default those of the
-    configuration, `fields` are the stars of each CCD, by default drawn over it, and `title` is that of the progress
-    bar. With `centered` exposures hold the observed stars centred on a pixel as well. A CCD that cannot be modelled
-    ends the loop with `strict`, after the models under way; otherwise it is reported and left out.
+    `model` is any reduction of an exposure, such as :func:`~.model_ccd`, or of those of a few CCDs. It runs on a thread
+    of its own, once at a time, in the order of the CCDs; no byte depends on the number of threads. `names` are by
+    default those of the configuration, `fields` are the stars of each CCD, by default drawn over it, and `title` is
+    that of the progress bar. With `centered` exposures hold the observed stars centred on a pixel as well. A CCD that
+    cannot be modelled ends the loop with `strict`, after the models under way; otherwise it is reported and left out.
 
     Raises
     ------
@@ -73,32 +83,52 @@ def simulate_ccds(
     overlap = thread_count(threads) > 1
     bar = reporter.stage(title or f"PSFs of {len(names)} CCDs", total=total)
     with bar as stage, ThreadPoolExecutor(1) as modeller:
-        pending: list[tuple[str, Future[_T]]] = []
+        pending: list[tuple[list[str], Future[Sequence[_T | PachonError]]]] = []
 
-        def collect(models: list[tuple[str, Future[_T]]]) -> None:
-            for ccd, future in models:
-                try:
-                    simulated.results[ccd] = future.result()
-                except ProductError:
-                    raise
-                except PachonError as error:
+        def submit(exposures: Sequence[CcdExposure]) -> None:
+            ccds = [exposure.name for exposure in exposures]
+            if isinstance(model, ModelTogether):
+                pending.append((ccds, modeller.submit(model.reduce, exposures)))
+            else:
+                pending.append((ccds, modeller.submit(_one_by_one, model, exposures, strict)))
+
+        def collect() -> None:
+            for ccds, future in pending:
+                for ccd, result in zip(ccds, future.result(), strict=False):
+                    if not isinstance(result, PachonError):
+                        simulated.results[ccd] = result
+                        continue
+                    if isinstance(result, ProductError):
+                        raise result
                     if strict:
-                        raise error.within(subject=f"CCD {ccd}") from None
-                    simulated.not_modelled[ccd] = error.reason
-                    reporter.line(left_out_line(ccd, error.reason))
+                        raise result.within(subject=f"CCD {ccd}") from None
+                    simulated.not_modelled[ccd] = result.reason
+                    reporter.line(left_out_line(ccd, result.reason))
+            pending.clear()
 
         exposed_ccds, groups = 0, _groups(experiment, names, fields)
         for exposures in _exposures(experiment, groups, centered=centered, threads=threads, progress=stage.advance):
-            collect(pending)
-            pending = [(exposure.name, modeller.submit(model, exposure)) for exposure in exposures]
+            collect()
+            submit(exposures)
             if not overlap:
-                collect(pending)
-                pending = []
+                collect()
             for exposure in exposures:
                 exposed_ccds += 1
                 stage.step(exposure.name, exposed_ccds, len(names))
-        collect(pending)
+        collect()
     return simulated
+
+
+def _one_by_one(
+    model: Callable[[CcdExposure], _T], exposures: Sequence[CcdExposure], strict: bool
+) -> list[_T | PachonError]:
+    """Return results of CCDs, with the error of a CCD in its place; nothing after one that ends the loop."""
+    results: list[_T | PachonError] = []
+    for exposure in exposures:
+        results.append(attempt(model, exposure))
+        if isinstance(results[-1], ProductError) or (strict and isinstance(results[-1], PachonError)):
+            break
+    return results
 
 
 def _groups(

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from ...core.errors import PachonError
 from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
 from ...measure.shapes import Shapes, fwhm, measure_shapes
 from ...measure.star_selection import require_stars
 from ...models.star_spectrum import blackbody_photons, effective_colour
 from ...reconstruction.ccd_product import CcdProduct, HoldoutStars, ObservedStars
+from ...reconstruction.psf_model.fit import CcdStars, fit_stars
 from ...reconstruction.psf_model.model import CLIPPING, PsfModel
 from ...sky.sky_shapes import along_sky, jacobians_on_sky
 from ...wavefront.chief_rays import fields_at
@@ -105,20 +109,34 @@ def fit_ccd_model(
     experiment: Experiment, observation: Observation, stars: StarField, snr: np.ndarray, *, noisy: bool = True
 ) -> PsfModel:
     """Fit the PSF model of the configuration to the observed stars of one CCD, S/N [n], that can be used."""
+    model = fit_ccd_models(experiment, [model_stars(experiment, observation, stars, snr)], noisy=noisy)[0]
+    if isinstance(model, PachonError):
+        raise model
+    return model
+
+
+def model_stars(experiment: Experiment, observation: Observation, stars: StarField, snr: np.ndarray) -> CcdStars:
+    """Return the observed stars of one CCD, S/N [n], that its model is fitted to; DomainError if they are too few."""
     recipe, used = experiment.config.reconstruction.psf_recipe(), observation.used
     require_stars(used, observation.defects, least_star_count(experiment.config))
     images, colours = observation.images[used], star_colours(experiment, stars)
     if recipe.interpolation.needs_noise:  # in electrons
         images = images * stars.electrons[used, None, None]
-    return PsfModel.fit(
+    return CcdStars(
         images,
         stars.observed[used],
-        recipe=recipe,
         weights=recipe.star_weights(snr[used]),
         extent=stars.ccd.extent,
-        clipping=CLIPPING if noisy else None,
         colour=None if colours is None else colours[used],
     )
+
+
+def fit_ccd_models(
+    experiment: Experiment, ccds: Sequence[CcdStars], *, noisy: bool = True
+) -> list[PsfModel | PachonError]:
+    """Fit the PSF models of the configuration to the stars of CCDs, with the error of a CCD in its place."""
+    recipe = experiment.config.reconstruction.psf_recipe()
+    return fit_stars(PsfModel, ccds, recipe, gain=1.0, clipping=CLIPPING if noisy else None)
 
 
 def star_colours(experiment: Experiment, stars: StarField) -> np.ndarray | None:

@@ -27,7 +27,7 @@ from functools import lru_cache
 import numpy as np
 import scipy.linalg
 
-from .pixel_sums import sums_of_products
+from ...core.row_sums import sums_of_products
 
 #: Fewest columns of a kernel: variance and length of the process, noise that all stars have, variances of the
 #: trend's terms of degree 1 and 2, and so on to its order. Lengths where the extent is 2 wide. A last column holds the
@@ -93,12 +93,11 @@ class SmoothCovariance:
     log_determinant: np.ndarray  #: [...]
 
     @classmethod
-    def of(cls, kernels: np.ndarray, terms: np.ndarray, noise: np.ndarray, trend: np.ndarray) -> SmoothCovariance:
-        """Return it for kernels, terms [n, n_terms] with their variances `trend` [..., n_terms], and noise [n]."""
-        variance = noise + kernels[..., PROCESS_COLUMNS - 1, None]
+    def of(cls, terms: np.ndarray, variance: np.ndarray, trend: np.ndarray) -> SmoothCovariance:
+        """Return it for terms [..., n, n_terms], their variances `trend` [..., n_terms], and the noise's [..., n]."""
         scaled = terms * np.sqrt(trend)[..., None, :]
         over_noise = np.swapaxes(scaled / variance[..., None], -1, -2)
-        root = np.linalg.cholesky(np.eye(terms.shape[1]) + over_noise @ scaled)
+        root = np.linalg.cholesky(np.eye(terms.shape[-1]) + over_noise @ scaled)
         log_root = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
         return cls(variance, np.linalg.solve(root, over_noise), np.log(variance).sum(axis=-1) + 2.0 * log_root)
 
@@ -139,7 +138,8 @@ def krige(
         inverse = scipy.linalg.inv(covariance, check_finite=False)
         weights, precision = inverse @ values, np.diagonal(inverse)
     else:
-        smooth = SmoothCovariance.of(kernel, terms, noise, trend_variances(kernel, terms.shape[1], colour_count))
+        trend_variance = trend_variances(kernel, terms.shape[1], colour_count)
+        smooth = SmoothCovariance.of(terms, noise + kernel[PROCESS_COLUMNS - 1], trend_variance)
         weights, precision = smooth.solve(values), smooth.precision
     trend = trend_variances(kernel, terms.shape[1], colour_count)[:, None] * (terms.T @ weights)
     return trend, weights, weights / precision[:, None]
@@ -202,17 +202,9 @@ def kernel_covariance(
     kernel: np.ndarray, distance: np.ndarray, terms: np.ndarray, noise: np.ndarray, colour_count: int = 0
 ) -> np.ndarray:
     """Return the covariance [n, n] of values at stars of given distances, terms of the trend and noise."""
-    decay = kernel[0] * np.exp(-distance / kernel[LENGTH])
-    return with_trend_and_noise(decay, kernel, terms, noise, trend_variances(kernel, terms.shape[1], colour_count))
-
-
-def with_trend_and_noise(
-    decay: np.ndarray, kernels: np.ndarray, terms: np.ndarray, noise: np.ndarray, trend: np.ndarray
-) -> np.ndarray:
-    """Return covariances of processes [..., n, n] with those of terms of variances `trend` and of the noise added."""
-    covariance = decay + (terms * trend[..., None, :]) @ terms.T
-    diagonals = covariance.reshape(*covariance.shape[:-2], -1)[..., :: len(noise) + 1]
-    diagonals += noise + kernels[..., PROCESS_COLUMNS - 1, None]
+    covariance = kernel[0] * np.exp(-distance / kernel[LENGTH])
+    covariance += (terms * trend_variances(kernel, terms.shape[1], colour_count)) @ terms.T
+    np.einsum("ii->i", covariance)[:] += noise + kernel[PROCESS_COLUMNS - 1]
     return np.asarray(covariance)
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from ...core.errors import ConfigError, DomainError
+from ...core.errors import ConfigError, DomainError, PachonError, attempt
 from ...core.threads import one_blas_thread
 from . import kriging
 from .basis import FittedBasis
@@ -34,20 +35,52 @@ class ModelFit:
     rejected: np.ndarray
 
 
+class CcdStars(NamedTuple):
+    """Stars of a CCD, as :meth:`~.PsfModel.fit` takes them."""
+
+    stamps: Any
+    positions: Any
+    weights: Any = None
+    masks: Any = None
+    extent: Any = None
+    colour: Any = None
+
+
 def fit_stars(
     kind: type[_Model],
-    stamps: Any,
-    positions: Any,
+    ccds: Sequence[CcdStars],
     recipe: Recipe,
     *,
-    weights: Any,
-    masks: Any,
-    extent: Any,
     gain: float | None,
     clipping: SigmaClipping | None,
-    colour: Any = None,
-) -> _Model:
-    """Fit basis and interpolation of a recipe to stars; arguments and errors as those of :meth:`~.PsfModel.fit`."""
+) -> list[_Model | PachonError]:
+    """Fit basis and interpolation of a recipe to the stars of each CCD, with the error of a CCD in its place.
+
+    Arguments and errors are those of :meth:`~.PsfModel.fit`. No CCD changes a byte of another.
+    """
+    with one_blas_thread():
+        fields = [attempt(_star_field, stars, recipe, gain=gain, clipping=clipping) for stars in ccds]
+        good = [field[0] for field in fields if not isinstance(field, PachonError)]
+        interpolations = iter(recipe.interpolation.fit_each(good))
+    models: list[_Model | PachonError] = []
+    for field in fields:
+        if isinstance(field, PachonError):
+            models.append(field)
+            continue
+        stars, unexplained, rejected = field
+        interpolation = next(interpolations)
+        if isinstance(interpolation, PachonError):
+            models.append(interpolation)
+        else:
+            models.append(kind(stars.basis, interpolation, stars.coefficients, unexplained, rejected))
+    return models
+
+
+def _star_field(
+    ccd: CcdStars, recipe: Recipe, *, gain: float | None, clipping: SigmaClipping | None
+) -> tuple[StarField, np.ndarray, np.ndarray]:
+    """Return the stars of a CCD in the basis of a recipe, what it leaves of each, and its rejected pixels, [n] both."""
+    stamps, positions, weights, masks, extent, colour = ccd
     images, bad = as_stamps(stamps, masks)
     n_stars, ny, nx = images.shape
     points = as_positions(positions)
@@ -77,34 +110,32 @@ def fit_stars(
     def basis_of(stars: CleanStars, weights: np.ndarray | None, count: int) -> FittedBasis:
         return basis.fit(stars, (ny, nx), count, weights)
 
-    with one_blas_thread():
-        interpolation.check_terms(terms[:, : term_count(needed_order)], needed_order, points, star_weights)
-        stars = cleaned_stars(images, bad, smooth_terms, clipping)
-        masked = bad if bad.any() else None
-        if masked is not None:
-            images = _completed(images, masked, stars)
-        chosen_order, basis_weights = orders[-1], None
-        if by_noise or automatic:
-            mean = stars.mean.reshape(ny, nx)
-            shapes = ShapeNoise.of(images, stars.deviations, mean, _checked_gain(images, gain), masked)
-            if automatic:
-                counts = np.arange(1, count + 1) if basis.automatic else np.array([count])
-                chosen_order, count = choose_by_cross_validation(
-                    stars, terms, shapes, orders, counts, basis_of, star_weights
-                )
-            if by_noise:
-                basis_weights = shapes.star_weights(stars.deviations, terms[:, : term_count(chosen_order)])
-                stars = stars.about_weighted_mean(basis_weights)
-                star_weights = basis_weights
-        order = chosen_order if fixed_order is None else fixed_order
-        fitted_basis = basis_of(stars, basis_weights, count)
-        coefficients, unexplained = fitted_basis.project(stars)
-        order_terms = terms[:, : term_count(order)]
-        field = StarField(
-            points, span, order, order_terms, coefficients, star_weights, images, fitted_basis, gain, masked, colours
-        )
-        fitted_interpolation = interpolation.fit(field)
-    return kind(fitted_basis, fitted_interpolation, coefficients, unexplained, stars.rejected.sum(axis=1))
+    interpolation.check_terms(terms[:, : term_count(needed_order)], needed_order, points, star_weights)
+    stars = cleaned_stars(images, bad, smooth_terms, clipping)
+    masked = bad if bad.any() else None
+    if masked is not None:
+        images = _completed(images, masked, stars)
+    chosen_order, basis_weights = orders[-1], None
+    if by_noise or automatic:
+        mean = stars.mean.reshape(ny, nx)
+        shapes = ShapeNoise.of(images, stars.deviations, mean, _checked_gain(images, gain), masked)
+        if automatic:
+            counts = np.arange(1, count + 1) if basis.automatic else np.array([count])
+            chosen_order, count = choose_by_cross_validation(
+                stars, terms, shapes, orders, counts, basis_of, star_weights
+            )
+        if by_noise:
+            basis_weights = shapes.star_weights(stars.deviations, terms[:, : term_count(chosen_order)])
+            stars = stars.about_weighted_mean(basis_weights)
+            star_weights = basis_weights
+    order = chosen_order if fixed_order is None else fixed_order
+    fitted_basis = basis_of(stars, basis_weights, count)
+    coefficients, unexplained = fitted_basis.project(stars)
+    order_terms = terms[:, : term_count(order)]
+    field = StarField(
+        points, span, order, order_terms, coefficients, star_weights, images, fitted_basis, gain, masked, colours
+    )
+    return field, unexplained, stars.rejected.sum(axis=1)
 
 
 def _completed(images: np.ndarray, masked: np.ndarray, stars: CleanStars) -> np.ndarray:

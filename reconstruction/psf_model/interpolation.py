@@ -7,18 +7,19 @@ the stars, with its part of a FITS file. A new kind is one file, and an entry in
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from ...core.errors import ConfigError
+from ...core.errors import ConfigError, PachonError, attempt
+from ...core.row_sums import sums_of_products
 from ...core.threads import one_blas_thread
 from .basis import FittedBasis
 from .checks import check_distinct_positions, check_terms
 from .colour import FittedColour, StarColours
 from .file_parts import ModelParts
-from .pixel_sums import sums_of_products
 from .polynomial import MOST_ORDER, Extent, automatic_orders, design_matrix
 
 # Order of the polynomials that predict outliers and masked pixels where the interpolation has none of its own.
@@ -118,6 +119,10 @@ class Interpolation(ABC):
     @abstractmethod
     def fit(self, stars: StarField) -> FittedInterpolation:
         """Fit the coefficients of stars."""
+
+    def fit_each(self, ccds: Sequence[StarField]) -> list[FittedInterpolation | PachonError]:
+        """Fit the coefficients of stars of several CCDs, with the error of a CCD in its place; as :meth:`fit`."""
+        return [attempt(self.fit, stars) for stars in ccds]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,13 +13,14 @@ the best weights, and on turbulent ones it is better (docs/howto/psf_models.md).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
 import numpy as np
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError
+from ...core.errors import DomainError, PachonError, attempt
 from ...core.statistics import RMS_PER_MAD, finite_row_medians, row_medians
 from ...core.threads import one_blas_thread
 from .colour import FittedColour
@@ -32,7 +33,7 @@ from .covariance import (
     krige_mean,
     predict,
 )
-from .covariance_search import fit_covariances
+from .covariance_search import ShapeSample, fit_covariances
 from .file_parts import ModelParts
 from .interpolation import FittedInterpolation, Interpolation, StarField
 from .pixel_fields import PixelFields, SignalCovariance, fit_pixel_fields, krige_residuals, residuals_left_out
@@ -78,6 +79,30 @@ class Kriging(Interpolation):
 
     def fit(self, stars: StarField) -> FittedKriging:
         """Krige the coefficients of stars by the covariances of their shapes."""
+        shapes = _StarShapes.of(stars)
+        return shapes.krige(fit_covariances([shapes.sample])[0])
+
+    def fit_each(self, ccds: Sequence[StarField]) -> list[FittedInterpolation | PachonError]:
+        """Krige the coefficients of stars of several CCDs, whose covariances are searched together."""
+        shapes = [attempt(_StarShapes.of, stars) for stars in ccds]
+        samples = [ccd.sample for ccd in shapes if not isinstance(ccd, PachonError)]
+        covariances = iter(fit_covariances(samples))
+        return [ccd if isinstance(ccd, PachonError) else attempt(ccd.krige, next(covariances)) for ccd in shapes]
+
+
+@dataclass(frozen=True, eq=False)
+class _StarShapes:
+    """Shape numbers of the stars of a CCD with their noise."""
+
+    stars: StarField
+    deviations: np.ndarray  #: of the stars from the mean, [n, n_pixels]
+    filters: np.ndarray  #: of the shape numbers, [3, n_pixels]
+    sky: np.ndarray  #: variance of a pixel of sky, [n]
+    sample: ShapeSample
+
+    @classmethod
+    def of(cls, stars: StarField) -> _StarShapes:
+        """Measure the shape numbers of stars."""
         mean = stars.basis.mean
         deviations = stars.basis.deviations(stars.coefficients)
         numbers, filters = shape_numbers(mean, deviations)
@@ -85,8 +110,13 @@ class Kriging(Interpolation):
         noise = star_noise(stars.images, deviations, mean, filters, stars.gain, stars.masked, sky=sky)
         noise = np.maximum(noise, _LEAST_NOISE * (numbers**2).mean(axis=0) + np.finfo(float).tiny)
         places = mapped(stars.positions, stars.extent)
-        terms, colour_count = stars.with_colour_terms(), stars.colour_terms.shape[1]
-        covariances = fit_covariances(places, numbers, noise, terms, colour_count=colour_count)
+        sample = ShapeSample(places, numbers, noise, stars.with_colour_terms(), stars.colour_terms.shape[1])
+        return cls(stars, deviations, filters, sky, sample)
+
+    def krige(self, covariances: Covariances) -> FittedKriging:
+        """Krige the coefficients of the stars by covariances."""
+        stars, mean = self.stars, self.stars.basis.mean
+        places, _, noise, terms, colour_count = self.sample
         of_stars = (noise / np.median(noise, axis=0)).mean(axis=1)
         fields, count = None, stars.terms.shape[1]
         if stars.basis.kind.has_components:
@@ -94,15 +124,16 @@ class Kriging(Interpolation):
                 places, stars.coefficients, terms, covariances, of_stars, colour_count=colour_count
             )
         else:
-            narrow_filters = shape_numbers(mean, deviations, _NARROW * core_variance(mean))[1]
-            all_filters = np.concatenate([filters, narrow_filters])
-            shapes = deviations @ all_filters.T
+            narrow_filters = shape_numbers(mean, self.deviations, _NARROW * core_variance(mean))[1]
+            all_filters = np.concatenate([self.filters, narrow_filters])
+            shapes = self.deviations @ all_filters.T
             shape_trend, dual = krige_mean(places, shapes, terms, covariances, of_stars, colour_count=colour_count)
             signal = SignalCovariance.of(covariances.kernel, places, terms, colour_count)
             at_stars = terms @ shape_trend + predict(places, places, covariances.kernel, dual)
-            pixel_noise = middle_star_noise(stars.images, sky, mean, of_stars, stars.gain)
-            fields = fit_pixel_fields(mean, deviations, all_filters, of_stars, pixel_noise, at_stars, signal)
-            residual_trend, residual_dual = krige_residuals(fields.split(deviations)[1], fields, signal, of_stars)
+            pixel_noise = middle_star_noise(stars.images, self.sky, mean, of_stars, stars.gain)
+            fields = fit_pixel_fields(mean, self.deviations, all_filters, of_stars, pixel_noise, at_stars, signal)
+            residuals = fields.split(self.deviations)[1]
+            residual_trend, residual_dual = krige_residuals(residuals, fields, signal, of_stars)
             trend, alpha = shape_trend @ fields.response + residual_trend, dual @ fields.response + residual_dual
         return FittedKriging(
             stars.positions,
@@ -318,13 +349,16 @@ def _noise_correlations(
     pixels = pixels / np.maximum(RMS_PER_MAD * row_medians(np.abs(pixels[:, sky])), np.finfo(float).tiny)[:, None, None]
     # Cosmic rays and neighbours would correlate.
     used = (np.abs(pixels) < _CLIP) & sky & (True if masked is None else ~masked)
-    pixels = np.where(used, pixels, 0.0)
-    square = (pixels**2).sum() / max(used.sum(), 1)
+    # In rows with so many dark pixels behind them that no lag leads into the light of another one.
+    room = ((0, 0), (0, max(dy for dy, _ in _LAGS)), (0, max(dx for _, dx in _LAGS)))
+    flags = np.pad(used.astype(np.float64), room)
+    flags, light = flags.ravel(), np.pad(np.where(used, pixels, 0.0), room).ravel()
+    square = (light @ light) / max(used.sum(), 1)
     correlations = {}
     for dy, dx in _LAGS if square > 0.0 else ():
-        first, second = _lagged(ny, nx, dy, dx)
-        count = max((used[:, *first] & used[:, *second]).sum(), 1)
-        correlation = float((pixels[:, *first] * pixels[:, *second]).sum() / (count * square))
+        shift = dy * (nx + room[2][1]) + dx
+        count = max(flags[:-shift] @ flags[shift:], 1.0)
+        correlation = float((light[:-shift] @ light[shift:]) / (count * square))
         if abs(correlation) > _SIGNIFICANT / math.sqrt(count):
             correlations[dy, dx] = correlation
     return correlations

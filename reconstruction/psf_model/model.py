@@ -16,7 +16,7 @@ from astropy.io import fits
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments, removed_arguments
-from ...core.errors import ProductError
+from ...core.errors import PachonError, ProductError
 from ...core.plotting import figure_at, styled
 from ...core.products import read_fits, write_fits
 from ...core.result import Result
@@ -24,7 +24,7 @@ from ...core.version import CREATOR
 from .basis import elbow_of
 from .colour import FittedColour, as_colours
 from .file import model_hdus, read_model
-from .fit import ModelFit, fit_stars
+from .fit import CcdStars, ModelFit, fit_stars
 from .outliers import SigmaClipping
 from .polynomial import Extent, as_positions
 from .recipe import Recipe, RecipeKeys, RecipeName
@@ -157,18 +157,11 @@ class PsfModel(ModelFit, Result):
             If an array has the wrong shape, a star has no flux or no pixel with weight, a pixel has none in any star,
             or the stars do not determine the polynomials (all on a line, say).
         """
-        return fit_stars(
-            cls,
-            stamps,
-            positions,
-            Recipe.of(recipe, **recipe_keys),
-            weights=weights,
-            masks=masks,
-            extent=extent,
-            gain=gain,
-            clipping=clipping,
-            colour=colour,
-        )
+        stars = CcdStars(stamps, positions, weights, masks, extent, colour)
+        model = fit_stars(cls, [stars], Recipe.of(recipe, **recipe_keys), gain=gain, clipping=clipping)[0]
+        if isinstance(model, PachonError):
+            raise model
+        return model
 
     def _label(self) -> str:
         ny, nx = self.mean.shape

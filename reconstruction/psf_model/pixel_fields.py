@@ -22,7 +22,7 @@ import numpy as np
 
 from ...core.errors import DomainError
 from .covariance import PROCESS_COLUMNS, pair_distances, trend_variances
-from .pixel_sums import powers_and_variances
+from .pixel_sums import log_powers_and_variances
 
 # Shape numbers to which pixels respond as to a stretch and a magnification; they come first.
 _SHAPE_NUMBERS = 3
@@ -136,9 +136,8 @@ class Contrasts:
             return 0.0
         squares = (self.axes.T @ values) ** 2
         factors = np.concatenate([[0.0], _FACTORS])
-        power, log_variances = powers_and_variances(squares, self.variances / mean_variance, relative, factors)
-        log_power = np.log(np.maximum(power, np.finfo(float).tiny)).sum(axis=1)
-        evidence = -0.5 * (log_variances + len(squares) * log_power)
+        log_powers, log_variances = log_powers_and_variances(squares, self.variances / mean_variance, relative, factors)
+        evidence = -0.5 * (log_variances + len(squares) * log_powers)
         best = int(np.argmax(evidence))
         return float(factors[best]) / mean_variance if evidence[best] > evidence[0] + _LEAST_EVIDENCE else 0.0
 

@@ -1,56 +1,32 @@
-"""Sums over stars or terms at positions, and powers of stars by the size of the signal.
-
-Sums are in the order of the stars, whatever the number of positions: no batch changes a byte.
-"""
+"""Powers of stars in pixels by the size of the signal."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ...core.launch import launch
+from ...core.row_sum_kernels import columns
+from ...core.row_sums import in_packets
 from ...core.warp_arrays import warp_array
-from .pixel_kernels import LANES, add_powers, add_products, columns
+from .pixel_kernels import add_powers
 
-# Variances whose product is taken before its logarithm: each is at most 4^12 times the 300 stars, so that none
-# overflows.
-_TOGETHER = 30
-
-
-def sums_of_products(weights: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the sums over rows [n, k] times weights [m, n], [m, k], each in the order of the rows.
-
-    A product of matrices rounds them in a way that depends on the number of positions.
-    """
-    count = rows.shape[1]
-    if not (len(weights) and len(rows)):
-        return np.zeros((len(weights), count))
-    padded = _in_packets(rows)
-    sums = np.empty((len(weights), *padded.shape[1:]))
-    arrays = [warp_array(weights), warp_array(padded, columns), warp_array(sums, columns)]
-    launch(add_products, len(weights), arrays, threads=1)
-    return sums.reshape(len(weights), -1)[:, :count]
+# Largest square: those of stars without noise have no bound.
+_LARGEST_SQUARE = 1e100
 
 
-def powers_and_variances(
+def log_powers_and_variances(
     squares: np.ndarray, spectrum: np.ndarray, relative: np.ndarray, factors: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return powers [n_factor, k] and sums of the logarithms of the variances [n_factor] for factors of the signal.
+    """Return sums of the logarithms of powers and of variances, [n_factor] both, for factors of the signal.
 
     The variances of squares [n, k] are 1 plus a factor times `spectrum` [n] times `relative` [k]; the power of a column
-    is the sum of its squares over them.
+    is the sum of its squares over them. Columns without any power are left out of its sums.
     """
-    count, padded = squares.shape[1], _in_packets(squares)
-    packets, groups = padded.shape[1], -(-len(squares) // _TOGETHER)
-    powers = np.empty((len(factors), packets, LANES))
-    products = np.empty((len(factors), groups, packets, LANES))
-    arrays = [warp_array(padded, columns), warp_array(spectrum), warp_array(_in_packets(relative[None])[0], columns)]
-    outputs = [warp_array(powers, columns), warp_array(products, columns)]
-    launch(add_powers, packets, [*arrays, warp_array(factors), _TOGETHER, *outputs], threads=1)
+    packets = in_packets(np.minimum(squares, _LARGEST_SQUARE))
     # Variances of the pixels that fill up the last packet are 1.
-    return powers.reshape(len(factors), -1)[:, :count], np.log(products).sum(axis=(1, 2, 3))
-
-
-def _in_packets(rows: np.ndarray) -> np.ndarray:
-    """Return rows [n, k] as packets [n, packet, lane], the last one filled up with zeros."""
-    padding = -rows.shape[1] % LANES
-    return np.pad(rows, ((0, 0), (0, padding))).reshape(len(rows), -1, LANES)
+    of_pixels = in_packets(relative[None])[:, 0]
+    sums = np.empty((2, len(packets), len(factors)))
+    arrays = [warp_array(packets, columns), warp_array(spectrum), warp_array(of_pixels, columns), warp_array(factors)]
+    launch(add_powers, len(packets), [*arrays, *map(warp_array, sums)], threads=1)
+    log_powers, log_variances = sums.sum(axis=1)
+    return log_powers, log_variances

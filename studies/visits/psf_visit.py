@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.errors import DomainError, error_context
+from ...core.errors import DomainError, PachonError, attempt, error_context
 from ...core.progress import Reporter
 from ...core.units import ARCSEC
 from ...models.telescope import Telescope
@@ -18,8 +18,8 @@ from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_stage import fit_focal_plane_model
 from ...pipeline.resolved_values import resolved_value
 from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_outline
-from ...pipeline.simulate.ccd_loop import simulate_ccds
-from ...pipeline.simulate.ccd_model import fit_ccd_model
+from ...pipeline.simulate.ccd_loop import ModelTogether, simulate_ccds
+from ...pipeline.simulate.ccd_model import fit_ccd_models, model_stars
 from ...pipeline.simulate.ccd_observation import Observation, collected_images, observe_ccd
 from ...pipeline.simulate.photometry import (
     effective_fwhm,
@@ -31,6 +31,7 @@ from ...pipeline.simulate.photometry import (
 from ...pipeline.simulate.screen_cover import check_screens
 from ...pipeline.simulate.star_field import StarField, magnitudes_at
 from ...reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
+from ...reconstruction.psf_model.fit import CcdStars as ModelStars
 from ..night.detector_row import noise_columns
 from .plan import Visit
 from .resample import resample_stamps
@@ -158,24 +159,43 @@ def visit_psfs(
     together = config.reconstruction.model == "focal_plane"
     fields, index = _star_fields(experiment, visit, points, threads)
 
-    def modelled(exposure: CcdExposure) -> _CcdResult:
+    def observed(exposure: CcdExposure) -> tuple[_CcdResult, ModelStars | None]:
+        """Return a CCD without its model, and the stars of this where it has one of its own."""
         stars, observed_psfs = exposure.positions, exposure.observed
         counts = stars.electrons * observed_psfs.lit_fraction
         images = collected_images(experiment, observed_psfs.image, observed_psfs.pixel_scale, counts)
         observation = observe_ccd(experiment, exposure.name, images, observed_psfs.pixel_scale, counts, noisy=True)
         true = np.concatenate([exposure.holdout.image, resolved_value(exposure.centered).image])
+        result = _CcdResult(exposure, observation, counts, true, None)
         if together:
-            return _CcdResult(exposure, observation, counts, true, None)
+            return result, None
         width = effective_fwhm(true, observed_psfs.pixel_scale)
         dimmed = stars.magnitude - 2.5 * np.log10(observed_psfs.lit_fraction)
         snr = signal_to_noise(dimmed, stars.band, config.atmosphere.exposure_s, width)
-        model = fit_ccd_model(experiment, observation, stars, snr)
-        return _CcdResult(exposure, observation, counts, true, model.at(_positions_in_order(stars)))
+        return result, model_stars(experiment, observation, stars, snr)
+
+    def modelled(exposures: Sequence[CcdExposure]) -> list[_CcdResult | PachonError]:
+        ccds = [attempt(observed, exposure) for exposure in exposures]
+        stars = [ccd[1] for ccd in ccds if not isinstance(ccd, PachonError) and ccd[1] is not None]
+        models = iter(fit_ccd_models(experiment, stars))
+        results: list[_CcdResult | PachonError] = []
+        for ccd in ccds:
+            if isinstance(ccd, PachonError):
+                results.append(ccd)
+                continue
+            result, own_stars = ccd
+            model = None if own_stars is None else next(models)
+            if isinstance(model, PachonError):
+                results.append(model)
+                continue
+            images = None if model is None else model.at(_positions_in_order(result.exposure.positions))
+            results.append(result._replace(model=images))
+        return results
 
     with experiment.screens(threads, reporter):
         simulated = simulate_ccds(
             experiment,
-            modelled,
+            ModelTogether(modelled),
             list(fields),
             fields=fields,
             centered=True,

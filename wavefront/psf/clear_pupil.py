@@ -12,17 +12,18 @@ from ...core.launch import launch
 from ...core.units import require_count
 from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
+from ...raytrace.kernels.surface_table import STOPPED
 from ...raytrace.launch import launch_bundles
 from ...raytrace.pack.surfaces import clear_annulus, pack_surfaces
 from ...raytrace.trace import trace_packets
-from .clear_pupil_kernels import find_edges
+from .clear_pupil_kernels import find_edges, square_distances
 
 # Spokes per ring: the phase of a blur varies some three times faster around the pupil than across its ring.
 _SPOKES_PER_RING = 3.2
 #: Most rings; more, of polynomials of a higher degree, add nothing.
 MOST_RINGS = 12
-# Rays on a spoke that determine the rims of apertures, by parabolas.
-_EDGE_RINGS = 3
+#: Rays on a spoke that determine the rims of apertures, by parabolas.
+EDGE_RINGS = 3
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class SpokePupil:
     fraction: np.ndarray  #: of the pupil's area within each ring, [n_ring]
     quadrature: np.ndarray  #: weights of the rings, of sum 1, [n_ring]
     unit: np.ndarray  #: directions of the spokes, [n_spoke, 2]
+    count: int  #: number of points that was wanted
 
     @classmethod
     def fill(cls, diameter: float, obscuration: float, count: int) -> SpokePupil:
@@ -54,6 +56,7 @@ class SpokePupil:
             fraction=fraction,
             quadrature=1.0 / (n_ring * (n_ring - 1) * legendre(node) ** 2),
             unit=np.stack([np.cos(angle), np.sin(angle)], axis=-1),
+            count=count,
         )
 
     @property
@@ -83,28 +86,64 @@ def clear_edges(
     all other apertures are ignored. ``direction`` [n_star, 3] is that of the light's travel; the wavelength [m] is that
     in vacuum.
     """
-    n_star, n_spoke = len(direction), len(unit)
-    outer = 0.5 * telescope.pupil_diameter
-    radius = np.linspace(telescope.pupil_obscuration * outer, outer, _EDGE_RINGS)
-    points = (radius[:, None, None] * unit).reshape(-1, 2)
+    return edges_of(telescope, aperture_distances(telescope, direction, unit, wavelength, threads), len(unit), threads)
+
+
+def aperture_distances(
+    telescope: Telescope, direction: np.ndarray, unit: np.ndarray, wavelength: float, threads: int | None = None
+) -> np.ndarray:
+    """Return squared distances of rays from the centres of clear apertures [m^2], [n_star, n_stop, 3 n_spoke].
+
+    The rays are those of :func:`clear_edges`, ring by ring, the apertures those of :func:`stopping_surfaces`.
+    """
+    points = (_edge_radius(telescope)[:, None, None] * unit).reshape(-1, 2)
     n_surface = len(telescope.surfaces)
     rays = launch_bundles(telescope, direction, wavelength, points)
     places = trace_packets(telescope, rays, n_surface, threads=threads).end.position
-    surfaces = pack_surfaces(telescope)
-    edges = np.empty((n_star, n_spoke, 2))
+    stops = stopping_surfaces(telescope)
+    squares = np.empty((len(direction), len(stops), len(points)))
+    launch(
+        square_distances,
+        len(direction),
+        [
+            pack_surfaces(telescope),
+            warp_array(stops, wp.int32),
+            warp_array(places.numpy().reshape(n_surface, 3, -1), wp.float64),
+            warp_array(squares, wp.float64),
+        ],
+        threads=threads,
+    )
+    return squares
+
+
+def edges_of(telescope: Telescope, squares: np.ndarray, n_spoke: int, threads: int | None = None) -> np.ndarray:
+    """Return the edges of :func:`clear_edges` from squares of :func:`aperture_distances`."""
+    edges = np.empty((len(squares), n_spoke, 2))
     launch(
         find_edges,
-        n_star * n_spoke,
+        len(squares) * n_spoke,
         [
-            surfaces,
-            warp_array(places.numpy().reshape(n_surface, 3, -1), wp.float64),
-            warp_array(radius, wp.float64),
+            pack_surfaces(telescope),
+            warp_array(stopping_surfaces(telescope), wp.int32),
+            warp_array(squares, wp.float64),
+            warp_array(_edge_radius(telescope), wp.float64),
             n_spoke,
             warp_array(edges, wp.float64),
         ],
         threads=threads,
     )
     return edges
+
+
+def stopping_surfaces(telescope: Telescope) -> np.ndarray:
+    """Return the indices of surfaces that stop light by a disc or ring."""
+    return np.flatnonzero(pack_surfaces(telescope).kinds.numpy()[:, STOPPED] == 1)
+
+
+def _edge_radius(telescope: Telescope) -> np.ndarray:
+    """Return the radii in the pupil of rays that determine the rims [m]."""
+    outer = 0.5 * telescope.pupil_diameter
+    return np.linspace(telescope.pupil_obscuration * outer, outer, EDGE_RINGS)
 
 
 def has_only_annuli(telescope: Telescope) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
-from ...raytrace.kernels.surface_table import APERTURE, ROTATION, STOPPED, VERTEX, PackedSurfaces
+from ...raytrace.kernels.surface_table import APERTURE, ROTATION, VERTEX, PackedSurfaces
 
 wp.set_module_options(FORWARD_OPTIONS)
 
@@ -60,10 +60,30 @@ def within(a: wp.float64, b: wp.float64, c: wp.float64, square: wp.float64):
 
 
 @wp.kernel
+def square_distances(
+    first: wp.int32,
+    surfaces: PackedSurfaces,
+    stops: wp.array(dtype=wp.int32),
+    position: wp.array3d(dtype=wp.float64),
+    squares: wp.array3d(dtype=wp.float64),
+):
+    """Square the distances of the rays of one star from the centres of clear apertures.
+
+    Arguments: stops [stop]: surfaces with an aperture; position [surface, 3, star * n_ray + ray]: telescope frame [m];
+    squares [star, stop, ray] [m^2].
+    """
+    star = first + wp.tid()
+    for stop in range(stops.shape[0]):
+        for ray in range(squares.shape[2]):
+            squares[star, stop, ray] = squared_distance(surfaces, stops[stop], position, star * squares.shape[2] + ray)
+
+
+@wp.kernel
 def find_edges(
     first: wp.int32,
     surfaces: PackedSurfaces,
-    position: wp.array3d(dtype=wp.float64),
+    stops: wp.array(dtype=wp.int32),
+    squares: wp.array3d(dtype=wp.float64),
     radius: wp.array(dtype=wp.float64),
     n_spoke: wp.int32,
     edges: wp.array3d(dtype=wp.float64),
@@ -73,45 +93,44 @@ def find_edges(
     The intersection of a ray with a surface is nearly linear in its place in the pupil. So the square of its distance
     from the centre of the aperture is a parabola along the spoke: three rays determine its intersection with the rim.
 
-    Arguments: position [surface, 3, (star * 3 + ring) * n_spoke + spoke]: telescope frame [m]; radius [3] of the rays
-    in the pupil, at equal steps [m]; edges [star, spoke, 2]: inner and outer radius, the same where all is dark.
+    Arguments: stops, squares [star, stop, ring * n_spoke + spoke]: those of :func:`square_distances`; radius [3] of the
+    rays in the pupil, at equal steps [m]; edges [star, spoke, 2]: inner and outer radius, the same where all is dark.
     """
     item = first + wp.tid()
     star = item // n_spoke
     spoke = item % n_spoke
-    ray = 3 * star * n_spoke + spoke
     half = wp.float64(0.5)
     step = radius[1] - radius[0]
     inside = radius[0]
     outside = radius[2]
-    for s in range(surfaces.kinds.shape[0]):
-        if surfaces.kinds[s, STOPPED] == 1:
-            a = squared_distance(surfaces, s, position, ray)
-            b = squared_distance(surfaces, s, position, ray + n_spoke)
-            c = squared_distance(surfaces, s, position, ray + 2 * n_spoke)
-            missed = a != a or b != b or c != c
-            rim = surfaces.numbers[s, APERTURE + 3] * surfaces.numbers[s, APERTURE + 3]
-            low, high = within(a, b, c, rim)
-            if missed:
-                # Rays that miss a surface pass beyond its rim: what is clear ends before the first of them.
-                low = wp.float64(0.0)
-                high = wp.float64(0.0)
-                if a < rim:
-                    high = wp.where(b < rim, wp.float64(1.0), wp.float64(0.0))
-                elif c < rim:
-                    low = wp.where(b < rim, wp.float64(1.0), wp.float64(2.0))
-                    high = wp.float64(2.0)
-            inside = wp.max(inside, radius[0] + step * low)
-            outside = wp.min(outside, radius[0] + step * high)
-            hole = surfaces.numbers[s, APERTURE + 2] * surfaces.numbers[s, APERTURE + 2]
-            low, high = within(a, b, c, hole)
-            # A parabola may dip a little below zero where rays meet.
-            if hole > wp.float64(0.0) and high > low:
-                # The larger of the two pieces that the hole leaves.
-                if low > wp.float64(2.0) - high:
-                    outside = wp.min(outside, radius[0] + step * low)
-                else:
-                    inside = wp.max(inside, radius[0] + step * high)
+    for stop in range(stops.shape[0]):
+        s = stops[stop]
+        a = squares[star, stop, spoke]
+        b = squares[star, stop, spoke + n_spoke]
+        c = squares[star, stop, spoke + 2 * n_spoke]
+        missed = a != a or b != b or c != c
+        rim = surfaces.numbers[s, APERTURE + 3] * surfaces.numbers[s, APERTURE + 3]
+        low, high = within(a, b, c, rim)
+        if missed:
+            # Rays that miss a surface pass beyond its rim: what is clear ends before the first of them.
+            low = wp.float64(0.0)
+            high = wp.float64(0.0)
+            if a < rim:
+                high = wp.where(b < rim, wp.float64(1.0), wp.float64(0.0))
+            elif c < rim:
+                low = wp.where(b < rim, wp.float64(1.0), wp.float64(2.0))
+                high = wp.float64(2.0)
+        inside = wp.max(inside, radius[0] + step * low)
+        outside = wp.min(outside, radius[0] + step * high)
+        hole = surfaces.numbers[s, APERTURE + 2] * surfaces.numbers[s, APERTURE + 2]
+        low, high = within(a, b, c, hole)
+        # A parabola may dip a little below zero where rays meet.
+        if hole > wp.float64(0.0) and high > low:
+            # The larger of the two pieces that the hole leaves.
+            if low > wp.float64(2.0) - high:
+                outside = wp.min(outside, radius[0] + step * low)
+            else:
+                inside = wp.max(inside, radius[0] + step * high)
     if inside >= outside:
         inside = half * (inside + outside)
         outside = inside

@@ -229,8 +229,7 @@ class LongExposureRenderer(PsfRenderer):
     def _expose(self, stars: Stars) -> ExposedStars:
         if self._general:
             return self._expose_lattice(stars)
-        optics = self._trace(stars.fields, self._pupil.points, self._threads)
-        edges = self._edges(stars.fields)
+        optics, edges = self._near_optics(stars)
         kinds = np.where(self._lit_fraction(edges) < _LEAST_LIT, _VIGNETTED, _NEAR)
         if self._options.n_pupil is None:
             rays = self._ray_counts(optics)
@@ -246,6 +245,10 @@ class LongExposureRenderer(PsfRenderer):
             return self._expose_lattice(stars) if kind == _VIGNETTED else self._expose_rays(kind, stars)
 
         return expose_by_kind(kinds, expose, stars)
+
+    def _near_optics(self, stars: Stars) -> tuple[PupilOptics, np.ndarray]:
+        """Return the optics of stars through the points on spokes, and the edges of their clear pupils."""
+        return self._trace(stars.fields, self._pupil.points, self._threads), self._edges(stars.fields)
 
     def _ray_counts(self, optics: PupilOptics) -> np.ndarray:
         """Return the number of rays of each star far from focus, 0 near it, shape [n_star] int."""

@@ -7,7 +7,7 @@ import pachon
 from pachon.core.errors import ConfigError, DomainError
 from pachon.measure.shapes import measure_shapes
 from pachon.reconstruction.psf_model.colour import ColourTerm
-from pachon.reconstruction.psf_model.covariance_search import Posterior
+from pachon.reconstruction.psf_model.covariance_posterior import Posterior, StarNumbers
 from pachon.reconstruction.psf_model.kriging import Kriging
 from pachon.reconstruction.psf_model.pixels import Pixels
 from pachon.reconstruction.psf_model.polynomial import design_matrix
@@ -160,15 +160,15 @@ def test_the_slope_of_the_posterior_with_colours_is_its_change():
     points = rng.uniform(-1.0, 1.0, (25, 2))
     distance = np.hypot(*np.moveaxis(points[:, None] - points, -1, 0))
     terms = np.column_stack([design_matrix(points, EXTENT, 2), rng.normal(size=(25, 3))])
+    both = np.zeros(2, dtype=int)
     for process in (True, False):
-        posterior = Posterior(
-            distance, 3 * rng.normal(size=(25, 3)), rng.uniform(0.1, 2.0, 25), terms, np.zeros(6), np.full(6, 2.0), 3
-        )
+        stars = StarNumbers(distance, 3 * rng.normal(size=(25, 3)), rng.uniform(0.1, 2.0, 25), terms)
+        posterior = Posterior.of([stars], np.zeros(6), np.full(6, 2.0), 3)
         at, present = rng.normal(size=6), np.array([process, process, True, True, True, True])
-        exact = posterior.negative_log_posterior(at[None], present[None])
+        exact = posterior.negative_log_posterior(at[None], present[None], both[:1])
         for column in range(6):
             step = np.eye(6)[column] * 1e-5
-            around = posterior.negative_log_posterior(np.stack([at + step, at - step]), np.stack([present] * 2))
+            around = posterior.negative_log_posterior(np.stack([at + step, at - step]), np.stack([present] * 2), both)
             above, below = around.value
             # Rounding of values near 100, over the step.
             assert exact.slope[0, column] == pytest.approx((above - below) / 2e-5, abs=1e-7 * abs(exact.value[0]))

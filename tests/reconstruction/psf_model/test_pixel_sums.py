@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from pachon.reconstruction.psf_model.pixel_sums import powers_and_variances, sums_of_products
+from pachon.core.row_sums import sums_of_products
+from pachon.reconstruction.psf_model.pixel_sums import log_powers_and_variances
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (3, 40, 32), (60, 41, 961), (7, 0, 5), (0, 4, 5)])
@@ -27,7 +28,15 @@ def test_powers_and_logarithms_of_variances(axes, pixels):
     spectrum[:] *= axes / spectrum.sum()
     spectrum[0], relative[0] = axes, 1.0
     factors = np.array([0.0, 1e-3, 1.0, 4.0**12])
-    powers, variances = powers_and_variances(squares, spectrum, relative, factors)
+    squares[:, -1] = 0.0  # of a pixel without light
+    powers, variances = log_powers_and_variances(squares, spectrum, relative, factors)
     restated = 1.0 + factors[:, None, None] * spectrum[:, None] * relative
-    np.testing.assert_allclose(powers, (squares / restated).sum(axis=1), rtol=1e-12)
+    power = (squares / restated).sum(axis=1)[:, :-1]
+    np.testing.assert_allclose(powers, np.log(power).sum(axis=1), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(variances, np.log(restated).sum(axis=(1, 2)), rtol=1e-12)
+
+
+def test_powers_of_stars_without_noise_have_no_bound():
+    squares = np.array([[1e300, 1e-200, 0.0]])
+    powers, _ = log_powers_and_variances(squares, np.ones(1), np.zeros(3), np.ones(1))
+    assert powers[0] == pytest.approx(np.log(1e100) + np.log(1e-150), rel=1e-12)

@@ -7,9 +7,12 @@ from pachon.core.errors import ConfigError, DomainError
 from pachon.core.threads import one_blas_thread
 from pachon.measure.shapes import measure_shapes
 from pachon.reconstruction.psf_model import kriging
-from pachon.reconstruction.psf_model.covariance_search import Posterior, fit_covariances
+from pachon.reconstruction.psf_model.covariance_posterior import Posterior, StarNumbers
+from pachon.reconstruction.psf_model.covariance_search import ShapeSample, fit_covariances
+from pachon.reconstruction.psf_model.fit import CcdStars, fit_stars
 from pachon.reconstruction.psf_model.model import PsfModel
 from pachon.reconstruction.psf_model.polynomial import design_matrix
+from pachon.reconstruction.psf_model.recipe import Recipe
 
 SIZE = 21
 EXTENT = (-1.0, 1.0, -1.0, 1.0)
@@ -83,7 +86,7 @@ def exact_fields(degree, count=60, seed=2):
 def test_the_form_of_a_field_is_found():
     with one_blas_thread():
         for degree, name in ((0, "constant"), (1, "linear"), (2, "quadratic")):
-            fields = [fit_covariances(*exact_fields(degree, seed=seed)) for seed in range(8)]
+            fields = fit_covariances([ShapeSample(*exact_fields(degree, seed=seed)) for seed in range(8)])
             probabilities = [covariances.forms().get(name, 0.0) for covariances in fields]
             # Chance alone gives some of the fields a further term, of about the size of its own error.
             assert np.median(probabilities) > 0.5
@@ -96,10 +99,41 @@ def test_the_form_of_a_field_is_found():
                 assert ((trend[:degree] > 10.0) & (trend[:degree] < 1000.0)).all()
                 assert (trend[degree:] == 0.0).all()
         # Degrees 3 and 4 come with a process, which is then small.
-        covariances = fit_covariances(*exact_fields(4))
+        covariances = fit_covariances([ShapeSample(*exact_fields(4))])[0]
         assert covariances.forms()["quartic, process"] > 0.99
         assert ((covariances.kernel[3:] > 10.0) & (covariances.kernel[3:] < 1000.0)).all()
         assert covariances.kernel[0] < 1.0
+
+
+def test_ccds_that_are_searched_together_have_the_bytes_of_each_alone():
+    # Forms of other CCDs, with other numbers of stars, end sooner and later.
+    counts = [33, 40, 34, 9]
+    samples = [ShapeSample(*exact_fields(degree % 4, count, seed=count)) for degree, count in enumerate(counts)]
+    with one_blas_thread():
+        for sample, together in zip(samples, fit_covariances(samples), strict=True):
+            alone = fit_covariances([sample])[0]
+            assert np.array_equal(together.kernels, alone.kernels)
+            assert np.array_equal(together.probabilities, alone.probabilities)
+
+
+def test_a_ccd_that_cannot_be_modelled_leaves_the_others():
+    rng = np.random.default_rng(3)
+    places = rng.uniform(0.0, 1.0, (12, 2))
+    ccds = [CcdStars(gaussian_stars(rng, 12), places, extent=EXTENT) for _ in range(3)]
+    ccds[1] = ccds[1]._replace(stamps=1e-6 * ccds[1].stamps)
+    first, second, third = fit_stars(PsfModel, ccds, Recipe.of(), gain=1.0, clipping=None)
+    assert isinstance(second, DomainError)
+    assert "electrons" in str(second)
+    for model, ccd in ((first, ccds[0]), (third, ccds[2])):
+        alone = PsfModel.fit(ccd.stamps, places, extent=EXTENT, clipping=None)
+        assert np.array_equal(model.at(places), alone.at(places))
+
+
+def gaussian_stars(rng, count):
+    """Round stars of 1e5 electrons on stamps of 15 pixels, with noise."""
+    y, x = np.indices((15, 15)) - 7.0
+    profile = np.exp(-0.5 * (x * x + y * y) / 2.0**2)
+    return 1e5 * profile / profile.sum() + rng.normal(0.0, 10.0, (count, 15, 15))
 
 
 def process_probability(covariances):
@@ -114,11 +148,13 @@ def test_a_process_is_found_where_there_is_one():
     rough = np.linalg.cholesky(np.exp(-distance / 0.5)) @ rng.normal(size=(80, 3))
     smooth = terms[:, :6] @ rng.normal(size=(6, 3)) + 1e-2 * rng.normal(size=(80, 3))
     with one_blas_thread():
-        covariances = fit_covariances(points, smooth + 5e-2 * rough, noise, terms)
+        covariances, of_smooth = fit_covariances(
+            [ShapeSample(points, numbers, noise, terms) for numbers in (smooth + 5e-2 * rough, smooth)]
+        )
         # 1e-2 of noise is the unit; the process drawn has a variance of 25.
         assert 8.0 < covariances.kernel[0] < 80.0
         assert process_probability(covariances) > 0.999
-        assert process_probability(fit_covariances(points, smooth, noise, terms)) < 0.5
+        assert process_probability(of_smooth) < 0.5
 
 
 @pytest.mark.parametrize("process", [True, False])
@@ -127,27 +163,27 @@ def test_the_slope_of_the_posterior_is_its_change(process):
     points = rng.uniform(-1.0, 1.0, (25, 2))
     distance = np.hypot(*np.moveaxis(points[:, None] - points, -1, 0))
     terms = design_matrix(points, EXTENT, 4)
-    posterior = Posterior(
-        distance, 3.0 * rng.normal(size=(25, 3)), rng.uniform(0.1, 2.0, 25), terms, np.zeros(7), np.full(7, 2.0)
-    )
+    numbers, noise = 3.0 * rng.normal(size=(25, 3)), rng.uniform(0.1, 2.0, 25)
+    posterior = Posterior.of([StarNumbers(distance, numbers, noise, terms)], np.zeros(7), np.full(7, 2.0))
     at, present = rng.normal(size=7), np.array([process, process, True, True, True, False, True])
+    both = np.zeros(2, dtype=int)
     value, slope, curvature, information = (
-        each[0] for each in vars(posterior.negative_log_posterior(at[None], present[None])).values()
+        each[0] for each in vars(posterior.negative_log_posterior(at[None], present[None], both[:1])).values()
     )
 
     def covariance_at(logarithms):
         variance, length, floor, *trend = np.where(present, np.exp(logarithms), 0.0)
         process_part = variance * np.exp(-distance / length) if process else 0.0
         trend_part = terms @ np.diag(np.repeat([1e4, *trend], [1, 2, 3, 4, 5])) @ terms.T
-        return np.diag(posterior.noise + floor) + process_part + trend_part
+        return np.diag(noise + floor) + process_part + trend_part
 
     covariance_matrix = covariance_at(at)
     likelihood = 1.5 * np.linalg.slogdet(covariance_matrix)[1]
-    likelihood += 0.5 * np.sum(posterior.numbers * np.linalg.solve(covariance_matrix, posterior.numbers))
+    likelihood += 0.5 * np.sum(numbers * np.linalg.solve(covariance_matrix, numbers))
     assert value == pytest.approx(likelihood + 0.5 * ((at[present] / 2.0) ** 2).sum(), rel=1e-10)
     for column in range(7):
         step = np.eye(7)[column] * 1e-5
-        around = posterior.negative_log_posterior(np.stack([at + step, at - step]), np.stack([present] * 2))
+        around = posterior.negative_log_posterior(np.stack([at + step, at - step]), np.stack([present] * 2), both)
         above, below = around.value
         # Rounding of values near 100, over the step.
         assert slope[column] == pytest.approx((above - below) / 2e-5, abs=1e-7 * abs(value))
