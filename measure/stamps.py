@@ -240,10 +240,12 @@ def fourier_shifts(
     `images` are [n, ny, nx], or one [ny, nx] that is moved to n places. The sums with periodic sincs along both axes
     are a fraction of the work of a transform of a small image.
     """
-    along_y, along_x = (
-        _shift_matrices(count, shift, lines)
-        for count, shift, lines in zip(images.shape[-2:], (dy, dx), (rows, columns), strict=True)
-    )
+    (ny, nx), count = images.shape[-2:], len(dx)
+    if (ny, rows) == (nx, columns):
+        along_both = _shift_matrices(ny, np.concatenate([dy, dx]), rows)
+        along_y, along_x = along_both[:count], along_both[count:]
+    else:
+        along_y, along_x = _shift_matrices(ny, dy, rows), _shift_matrices(nx, dx, columns)
     with one_blas_thread():
         return np.asarray(along_y @ images @ along_x.transpose(0, 2, 1))
 
