@@ -230,17 +230,11 @@ def fit_own_stars(
     )
     good = stars.images[used]
     used_masks = masks_of(stars.filled, used)
-    weightless = used_masks if used_masks.any() else None
     model = fit(used_indices)
     predicted = predict(model)
-    psf = predicted.mean(axis=0)
-    stamps_used = good / good.sum(axis=(1, 2), keepdims=True)
-    deviations = (stamps_used - psf).reshape(len(used_indices), -1)
-    filters = kriging.shape_numbers(psf, deviations, weight_sigma(scale, weight) ** 2)[1]
-    # Shape numbers are twice the changes of e and of the logarithm of the size.
-    sigma = 0.5 * np.sqrt(kriging.star_noise(good, deviations, psf, filters, gain, weightless))
     held_out = _spread(measure_shapes(predicted, scale, weight), used)
-    sigmas = np.sqrt((sigma[:, :2] ** 2).mean(axis=1)), sigma[:, 2]
+    flux = good.sum(axis=(1, 2))
+    kriging.require_electrons(flux * gain, gain)
     return OwnStars(
         model,
         places,
@@ -249,10 +243,10 @@ def fit_own_stars(
         used,
         shapes,
         held_out,
-        stamps_used,
+        good / flux[:, None, None],
         predicted,
         used_masks,
-        *sigmas,
+        flux * gain,
         scale,
         weight,
         "given" if model_options else DEFAULT_KIND,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,8 +21,10 @@ from ...measure.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ell
 from ...measure.rho_statistics import RhoStatistics, rho_statistics
 from ...measure.shapes import Shapes, fwhm
 from ...measure.star_selection import StarFlag
+from ..psf_model.kriging import shape_numbers, star_noise
 from ..psf_model.model import PsfModel
 from ..stamp_gallery import StampGallery, stretched
+from .masked_stars import weight_sigma
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,8 +62,8 @@ class OwnStars(Result):
         Used stars and the models made without them, unit sum, [n_used, ny, nx].
     masks : ndarray
         Pixels of `stamps` without weight, which hold the model in place of the star, bool [n_used, ny, nx].
-    sigma_e, sigma_size : ndarray
-        Noise of a component of the ellipticity, and of the relative size, of the used stars, [n_used].
+    electrons : ndarray
+        Of the used stars, [n_used].
     pixel_scale, weight_fwhm : float
         Of the stamps [rad], and of the weight of the moments [rad].
     kind : str
@@ -79,8 +82,7 @@ class OwnStars(Result):
     stamps: np.ndarray
     predicted: np.ndarray
     masks: NDArray[np.bool_]
-    sigma_e: np.ndarray
-    sigma_size: np.ndarray
+    electrons: np.ndarray
     pixel_scale: float
     weight_fwhm: float
     kind: str
@@ -103,6 +105,27 @@ class OwnStars(Result):
             "held_out_size": (model_shapes.size / ARCSEC, "arcsec", "size of the model made without the star"),
         }
         return described_table(columns, {})
+
+    @property
+    def sigma_e(self) -> np.ndarray:
+        """Noise of a component of the ellipticity of the used stars, [n_used]."""
+        return np.sqrt((self._noise[:, :2] ** 2).mean(axis=1))
+
+    @property
+    def sigma_size(self) -> np.ndarray:
+        """Noise of the relative size of the used stars, [n_used]."""
+        return self._noise[:, 2]
+
+    @cached_property
+    def _noise(self) -> np.ndarray:
+        """Noise of e1, e2 and of the relative size, [n_used, 3]."""
+        psf = self.predicted.mean(axis=0)
+        deviations = (self.stamps - psf).reshape(len(self.stamps), -1)
+        filters = shape_numbers(psf, deviations, weight_sigma(self.pixel_scale, self.weight_fwhm) ** 2)[1]
+        images = self.stamps * self.electrons[:, None, None]
+        # Shape numbers are twice the changes of e and of the logarithm of the size.
+        masked = self.masks if self.masks.any() else None
+        return 0.5 * np.sqrt(star_noise(images, deviations, psf, filters, 1.0, masked))
 
     def residuals(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return e1, e2 and relative size of the used stars less those predicted without them, [n_used] each."""

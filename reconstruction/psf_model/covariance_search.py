@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -54,8 +55,12 @@ _LOW_DEGREES = (1.0, 1.0)
 _ALL_DEGREES = (2.5, 0.5)
 # More stars than this add little to the covariance, and cost their cube; the brightest are taken.
 _MOST_STARS = 300
-# A search ends where the next step is expected to gain less, in the logarithm of the posterior.
-_LEAST_GAIN = 1e-5
+# A search ends where the next step is expected to gain less, in the logarithm of the posterior: a hundredth of the
+# standard deviations of the logarithms.
+_LEAST_GAIN = 1e-4
+# ... or where it is nearer than this to a better place of another search for the same form, in all logarithms: a
+# fraction of their standard deviations.
+_SAME_PLACE = 0.3
 # Steps gain less than so many times what they are expected to.
 _SURE = 5.0
 # Most steps of a search, and the longest one of a logarithm.
@@ -194,6 +199,22 @@ class SecondOrder:
         return np.asarray(-np.linalg.solve(matrices, np.where(free, self.slope, 0.0)[:, :, None])[:, :, 0])
 
 
+class _Changes(NamedTuple):
+    """Changes by the logarithms of the columns of kernels before those of the trend, [m, p]: three, or noise alone.
+
+    dC are the changes of the covariance C by them, y the values of the stars, t the terms of the trend.
+    """
+
+    solved: np.ndarray  #: C^-1 times values and terms, [m, n, 3 + n_terms]
+    log_determinant: np.ndarray  #: of C, [m]
+    slope: np.ndarray  #: of twice the value, [m, p]
+    expected: np.ndarray  #: tr(C^-1 dC C^-1 dC'), [m, p, p]
+    observed: np.ndarray  #: y' C^-1 dC C^-1 dC' C^-1 y, [m, p, p]
+    expected_with_terms: np.ndarray  #: t' C^-1 dC C^-1 t, [m, p, n_terms]
+    with_terms: np.ndarray  #: t' C^-1 dC C^-1 y, [m, p, n_terms, 3]
+    bend: np.ndarray  #: as the slope, by the part of the second change by the length that is not the first, [m]
+
+
 @dataclass(frozen=True, eq=False)
 class Posterior:
     """Posterior probability of the logarithms of kernels' columns, for numbers in units of the noise."""
@@ -217,75 +238,98 @@ class Posterior:
         process, or none has.
         """
         kernels = self.kernels(logarithms, present)
-        count, common = self.numbers.shape[1], kernels[:, _NOISE]
         trend = trend_variances(kernels, self.terms.shape[1], self.colour_count)
-        slope, (expected, observed) = np.zeros(kernels.shape), np.zeros((2, *kernels.shape, kernels.shape[1]))
         # A change dC of the covariance changes the value by half the sum of count C^-1 - C^-1 y y' C^-1 times dC. The
         # second derivative by two of them has the expected part count/2 tr(C^-1 dC C^-1 dC'), and without what the
         # values are expected to be y' C^-1 dC C^-1 dC' C^-1 y less that.
-        if present[0, 0]:
-            ratio = self.distance / kernels[:, LENGTH, None, None]
-            changes = np.empty((len(kernels), 2, *self.distance.shape))  # by the variance and by the length
-            decay = np.multiply(kernels[:, 0, None, None], np.exp(-ratio), out=changes[:, 0])
-            np.multiply(decay, ratio, out=changes[:, 1])
-            inverse, log_determinant = _inverses(with_trend_and_noise(decay, kernels, self.terms, self.noise, trend))
-            inverse_values = inverse @ self.values_and_terms
-            precision, square = np.diagonal(inverse, axis1=1, axis2=2), np.einsum("mij,mij->m", inverse, inverse)
-            solved, inverse_terms = inverse_values[:, :, :count], inverse_values[:, :, count:]
-            again = inverse @ solved
-            surprise = count * inverse - solved @ solved.transpose(0, 2, 1)
-            relative = inverse[:, None] @ changes
-            changed = changes @ inverse_values[:, None]
-            back = inverse[:, None] @ changed[..., :count]
-            slope[:, :2] = np.einsum("mij,mpij->mp", surprise, changes)
-            bend = np.einsum("mij,mij->m", surprise * ratio, changes[:, 1]) - slope[:, LENGTH]
-            expected[:, :2, :2] = np.einsum("mpij,mqji->mpq", relative, relative)
-            expected[:, :2, _NOISE] = common[:, None] * np.einsum("mpij,mij->mp", relative, inverse)
-            of_terms = np.einsum("mna,mpna->mpa", inverse_terms, changed[..., count:])
-            expected[:, :2] += (trend[:, None] * of_terms) @ self.to_columns
-            observed[:, :2, :2] = np.einsum("mpnk,mqnk->mpq", changed[..., :count], back)
-            observed[:, :2, _NOISE] = common[:, None] * np.einsum("mnk,mpnk->mp", solved, back)
-            of_terms = np.einsum("mpak,mak->mpa", self.terms.T @ back, self.terms.T @ solved)
-            observed[:, :2] += (trend[:, None] * of_terms) @ self.to_columns
-        else:
-            smooth = SmoothCovariance.of(kernels, self.terms, self.noise, trend)
-            inverse_values, log_determinant = smooth.solve(self.values_and_terms), smooth.log_determinant
-            precision, square = smooth.precision, smooth.square
-            solved, inverse_terms = inverse_values[:, :, :count], inverse_values[:, :, count:]
-            again, bend = smooth.solve(solved), 0.0
+        changes = self._changes_with_process(kernels, trend) if present[0, 0] else self._changes(kernels, trend)
+        count, first = self.numbers.shape[1], PROCESS_COLUMNS - changes.slope.shape[1]
+        before_trend = slice(first, PROCESS_COLUMNS)
+        between = self.values_and_terms.T @ changes.solved
+        of_values, of_terms = between[:, count:, :count], between[:, count:, count:]
+        products = of_values @ of_values.transpose(0, 2, 1)
         away = np.where(present, (logarithms - self.middle) / self.width, 0.0)
         value = 0.5 * (
-            np.einsum("mnk,nk->m", solved, self.numbers) + count * log_determinant + np.einsum("mc,mc->m", away, away)
+            np.einsum("mkk->m", between[:, :count, :count])
+            + count * changes.log_determinant
+            + np.einsum("mc,mc->m", away, away)
         )
-        slope[:, _NOISE] = common * (count * precision.sum(axis=1) - np.einsum("mnk,mnk->m", solved, solved))
-        transposed = self.terms.T @ inverse_values
-        of_values, between = transposed[:, :, :count], transposed[:, :, count:]
-        products = of_values @ of_values.transpose(0, 2, 1)
-        change = np.diagonal(count * between - products, axis1=1, axis2=2)
-        slope += (trend * change) @ self.to_columns
-        slope *= 0.5
-        expected[:, _NOISE, _NOISE] = common**2 * square
-        observed[:, _NOISE, _NOISE] = common**2 * np.einsum("mnk,mnk->m", solved, again)
-        of_noise = common[:, None] * trend
-        of_terms = np.einsum("mna,mna->ma", inverse_terms, inverse_terms)
-        expected[:, _NOISE] += (of_noise * of_terms) @ self.to_columns
-        of_terms = np.einsum("mak,mak->ma", self.terms.T @ again, of_values)
-        observed[:, _NOISE] += (of_noise * of_terms) @ self.to_columns
-        trends = trend[:, :, None] * trend[:, None] * between
-        expected += self.to_columns.T @ (trends * between) @ self.to_columns
-        observed += self.to_columns.T @ (trends * products) @ self.to_columns
-        expected *= 0.5 * count
-        curvature = observed - expected
+        of_trend = count * np.einsum("maa->ma", of_terms) - np.einsum("maa->ma", products)
+        slope = (0.5 * trend * of_trend) @ self.to_columns
+        slope[:, before_trend] = 0.5 * changes.slope
+        trends = trend[:, :, None] * trend[:, None] * of_terms
+        matrices = self.to_columns.T @ (trends * np.stack([of_terms, products])) @ self.to_columns
+        observed_with_trend = np.einsum("mpak,mak->mpa", changes.with_terms, of_values)
+        with_trend = trend[:, None] * np.stack([changes.expected_with_terms, observed_with_trend])
+        rows = with_trend @ self.to_columns
+        matrices[:, :, before_trend] += rows
+        matrices[:, :, :, before_trend] += rows.swapaxes(2, 3)
+        matrices[:, :, before_trend, before_trend] = np.stack([changes.expected, changes.observed])
+        expected = 0.5 * count * matrices[0]
+        curvature = matrices[1] - expected
         # Of logarithms the second derivative has the first one besides.
         _diagonals(curvature)[:] += slope
-        curvature[:, LENGTH, LENGTH] += 0.5 * bend - slope[:, LENGTH]
-        curvature[:, 0, LENGTH] += slope[:, LENGTH]
+        if first == 0:
+            curvature[:, LENGTH, LENGTH] += 0.5 * changes.bend - 2.0 * slope[:, LENGTH]
+            curvature[:, 0, LENGTH] += slope[:, LENGTH]
+            curvature[:, LENGTH, 0] += slope[:, LENGTH]
         prior = np.where(present, self.width**-2.0, 0.0)
-        lower = np.tri(len(self.middle), k=-1, dtype=bool)
         for matrix in (expected, curvature):
             _diagonals(matrix)[:] += prior
-            np.copyto(matrix, matrix.transpose(0, 2, 1).copy(), where=lower)
         return SecondOrder(value, slope + away / self.width, curvature, expected)
+
+    def _changes_with_process(self, kernels: np.ndarray, trend: np.ndarray) -> _Changes:
+        """Return what changes by the first three columns of kernels with a process: its variance, length, and noise."""
+        count, common = self.numbers.shape[1], kernels[:, _NOISE]
+        ratio = self.distance / kernels[:, LENGTH, None, None]
+        # By the length for the second time, by the variance, by the length.
+        changes = np.empty((len(kernels), 3, *self.distance.shape))
+        decay = np.multiply(kernels[:, 0, None, None], np.exp(-ratio), out=changes[:, 1])
+        np.multiply(decay, ratio, out=changes[:, 2])
+        np.multiply(changes[:, 2], ratio, out=changes[:, 0])
+        inverse, log_determinant = _inverses(with_trend_and_noise(decay, kernels, self.terms, self.noise, trend))
+        solved = inverse @ self.values_and_terms
+        changed = np.empty((len(kernels), 4, *self.values_and_terms.shape))
+        np.matmul(changes, solved[:, None], out=changed[:, :3])
+        np.multiply(common[:, None, None], solved, out=changed[:, 3])
+        squares = np.einsum("mna,mpna->mpa", solved, changed)
+        traces = np.einsum("mij,mpij->mp", inverse, changes)
+        trace_of_noise = common * np.einsum("mii->m", inverse)
+        slope = count * np.column_stack([traces, trace_of_noise]) - squares[:, :, :count].sum(axis=2)
+        relative = np.empty((len(kernels), 3, *self.distance.shape))
+        np.matmul(inverse[:, None], changes[:, 1:], out=relative[:, :2])
+        np.multiply(common[:, None, None], inverse, out=relative[:, 2])
+        of_values = changed[:, 1:, :, :count]
+        return _Changes(
+            solved,
+            log_determinant,
+            slope[:, 1:],
+            np.einsum("mpij,mqji->mpq", relative, relative),
+            np.einsum("mpnk,mqnk->mpq", of_values, inverse[:, None] @ of_values),
+            squares[:, 1:, count:],
+            solved[:, None, :, count:].swapaxes(2, 3) @ of_values,
+            slope[:, 0],
+        )
+
+    def _changes(self, kernels: np.ndarray, trend: np.ndarray) -> _Changes:
+        """Return what changes by the noise that all stars have, of kernels without a process."""
+        count, common = self.numbers.shape[1], kernels[:, _NOISE, None, None]
+        smooth = SmoothCovariance.of(kernels, self.terms, self.noise, trend)
+        solved = smooth.solve(self.values_and_terms)
+        of_values, of_terms = solved[:, :, :count], solved[:, :, count:]
+        squares = np.einsum("mna,mna->ma", solved, solved)[:, None]
+        trace, square_trace = smooth.precision.sum(axis=1), smooth.square
+        observed = np.einsum("mnk,mnk->m", of_values, smooth.solve(of_values))
+        return _Changes(
+            solved,
+            smooth.log_determinant,
+            common[:, :, 0] * (count * trace[:, None] - squares[:, :, :count].sum(axis=2)),
+            common**2 * square_trace[:, None, None],
+            common**2 * observed[:, None, None],
+            common * squares[:, :, count:],
+            common[..., None] * (of_terms.swapaxes(1, 2) @ of_values)[:, None],
+            np.zeros(len(kernels)),
+        )
 
     @cached_property
     def values_and_terms(self) -> np.ndarray:
@@ -311,7 +355,8 @@ class Posterior:
 
         From starts by Newton's steps, with the expected second derivatives where the surface is no bowl (Fisher's
         scoring), and damped where a step gains nothing (Marquardt 1963); all forms at once. Columns that are not
-        present stay as they were. The search for a form ends, too, where its value will stay above `largest`.
+        present stay as they were. The search for a form ends, too, where its value will stay above `largest`, or where
+        one from another start has been.
         """
         low, high = self.middle - _REACH, self.middle + _REACH
         varied = present & ~(fixed_length & (np.arange(present.shape[1]) == LENGTH))
@@ -319,7 +364,12 @@ class Posterior:
         best = self.negative_log_posterior(logarithms, present)
         damping, moving = np.zeros(len(starts)), np.arange(len(starts))
         most = np.broadcast_to(largest, damping.shape)
+        same_form = (present[:, None] == present).all(axis=2) & ~np.eye(len(present), dtype=bool)
         for _ in range(_MOST_STEPS):
+            if same_form.any() and len(moving):
+                beside = np.abs(logarithms[moving, None] - logarithms).max(axis=2) < _SAME_PLACE
+                beside &= same_form[moving] & (best.value < best.value[moving, None])
+                moving = moving[~beside.any(axis=1)]
             at, here = logarithms[moving], best.of_forms(moving)
             free = varied[moving] & ~((at <= low) & (here.slope > 0.0)) & ~((at >= high) & (here.slope < 0.0))
             step = here.step(free, damping[moving])

@@ -264,15 +264,20 @@ def star_noise(
     noise = sky_variance[:, None] * sky_noise
     if gain is not None:
         electrons = images.sum(axis=(1, 2)) * gain
-        if np.median(electrons) < FEWEST_ELECTRONS:
-            raise DomainError(
-                f"gain = {gain:g}: the middle star has {np.median(electrons):.3g} electrons; expected stamps in "
-                "electrons, gain in electrons a unit, or gain = None for no photon noise"
-            )
+        require_electrons(electrons, gain)
         light = np.maximum(mean.ravel(), 0.0)
         photon_noise = (filters**2 @ light) * _correlation_factors(correlations, filters * np.sqrt(light), mean.shape)
         noise = noise + photon_noise / electrons[:, None]
     return noise
+
+
+def require_electrons(electrons: np.ndarray, gain: float) -> None:
+    """Raise DomainError for stars [n] of fewer electrons than photon noise is known of."""
+    if np.median(electrons) < FEWEST_ELECTRONS:
+        raise DomainError(
+            f"gain = {gain:g}: the middle star has {np.median(electrons):.3g} electrons; expected stamps in "
+            "electrons, gain in electrons a unit, or gain = None for no photon noise"
+        )
 
 
 def middle_star_noise(

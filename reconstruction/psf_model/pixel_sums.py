@@ -8,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...core.launch import launch
-from ...core.warp_arrays import warp_array
-from .pixel_kernels import LANES, add_powers, add_products, columns
+from .pixel_kernels import LANES, add_powers, add_products
 
 # Variances whose product is taken before its logarithm: each is at most 4^12 times the 300 stars, so that none
 # overflows.
@@ -26,8 +25,7 @@ def sums_of_products(weights: np.ndarray, rows: np.ndarray) -> np.ndarray:
         return np.zeros((len(weights), count))
     padded = _in_packets(rows)
     sums = np.empty((len(weights), *padded.shape[1:]))
-    arrays = [warp_array(weights), warp_array(padded, columns), warp_array(sums, columns)]
-    launch(add_products, len(weights), arrays, threads=1)
+    launch(add_products, len(weights), [weights, padded, sums], threads=1)
     return sums.reshape(len(weights), -1)[:, :count]
 
 
@@ -43,14 +41,15 @@ def powers_and_variances(
     packets, groups = padded.shape[1], -(-len(squares) // _TOGETHER)
     powers = np.empty((len(factors), packets, LANES))
     products = np.empty((len(factors), groups, packets, LANES))
-    arrays = [warp_array(padded, columns), warp_array(spectrum), warp_array(_in_packets(relative[None])[0], columns)]
-    outputs = [warp_array(powers, columns), warp_array(products, columns)]
-    launch(add_powers, packets, [*arrays, warp_array(factors), _TOGETHER, *outputs], threads=1)
+    inputs = [padded, spectrum, _in_packets(relative[None])[0], factors, _TOGETHER]
+    launch(add_powers, packets, [*inputs, powers, products], threads=1)
     # Variances of the pixels that fill up the last packet are 1.
     return powers.reshape(len(factors), -1)[:, :count], np.log(products).sum(axis=(1, 2, 3))
 
 
 def _in_packets(rows: np.ndarray) -> np.ndarray:
     """Return rows [n, k] as packets [n, packet, lane], the last one filled up with zeros."""
-    padding = -rows.shape[1] % LANES
-    return np.pad(rows, ((0, 0), (0, padding))).reshape(len(rows), -1, LANES)
+    packets = -(-rows.shape[1] // LANES)
+    padded = np.zeros((len(rows), packets * LANES))
+    padded[:, : rows.shape[1]] = rows
+    return padded.reshape(len(rows), packets, LANES)
