@@ -341,8 +341,8 @@ def _bright_spans(images: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     for axis in (2, 1):
         lit, count = bright.any(axis=axis), images.shape[3 - axis]
         first, last = lit.argmax(axis=1), count - 1 - lit[:, ::-1].argmax(axis=1)
-        bounds.append(np.maximum((first - 2) // _SPAN_STEP * _SPAN_STEP, 0))
-        bounds.append(np.minimum(-(-(last + 3) // _SPAN_STEP) * _SPAN_STEP, count))
+        bounds.append(np.maximum((first - 1) // _SPAN_STEP * _SPAN_STEP, 0))
+        bounds.append(np.minimum(-(-(last + 2) // _SPAN_STEP) * _SPAN_STEP, count))
     return np.stack(bounds, axis=1)
 
 

@@ -19,7 +19,7 @@ from ...core.units import ARCMIN, ARCSEC, require_count
 from ...measure.correlation import LARGEST_SEPARATION, LEAST_SEPARATION, MOST_BINS, SeparationBins
 from ...measure.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
 from ...measure.rho_statistics import RhoStatistics, rho_statistics
-from ...measure.shapes import Shapes, fwhm
+from ...measure.shapes import Shapes, fwhm, measure_shapes
 from ...measure.star_selection import StarFlag
 from ..psf_model.kriging import shape_numbers, star_noise
 from ..psf_model.model import PsfModel
@@ -56,14 +56,16 @@ class OwnStars(Result):
         [n] bool.
     shapes : Shapes
         Of the stars, angles in rad.
-    held_out : Shapes
-        Of the model made without the star and others of its part; NaN for stars that are not used.
-    stamps, predicted : ndarray
-        Used stars and the models made without them, unit sum, [n_used, ny, nx].
+    stamps : ndarray
+        Used stars of unit sum, [n_used, ny, nx].
     masks : ndarray
         Pixels of `stamps` without weight, which hold the model in place of the star, bool [n_used, ny, nx].
     electrons : ndarray
         Of the used stars, [n_used].
+    parts : list of ndarray
+        Indices of the used stars that are held out together.
+    refitted : ndarray or None
+        Predictions of the used stars by models that were fitted without them, [n_used, ny, nx], where that is needed.
     pixel_scale, weight_fwhm : float
         Of the stamps [rad], and of the weight of the moments [rad].
     kind : str
@@ -78,11 +80,11 @@ class OwnStars(Result):
     flags: np.ndarray
     used: NDArray[np.bool_]
     shapes: Shapes
-    held_out: Shapes
     stamps: np.ndarray
-    predicted: np.ndarray
     masks: NDArray[np.bool_]
     electrons: np.ndarray
+    parts: list[np.ndarray]
+    refitted: np.ndarray | None
     pixel_scale: float
     weight_fwhm: float
     kind: str
@@ -105,6 +107,23 @@ class OwnStars(Result):
             "held_out_size": (model_shapes.size / ARCSEC, "arcsec", "size of the model made without the star"),
         }
         return described_table(columns, {})
+
+    @cached_property
+    def predicted(self) -> np.ndarray:
+        """Models made without the used star and others of its part, of unit sum, [n_used, ny, nx]."""
+        if self.refitted is not None:
+            return self.refitted
+        return self.model.basis.at(self.model.interpolation.left_out(self.parts, self.model.coefficients))
+
+    @cached_property
+    def held_out(self) -> Shapes:
+        """Shapes of the model made without the star and others of its part; NaN for stars that are not used."""
+        values = {}
+        for name, value in vars(measure_shapes(self.predicted, self.pixel_scale, self.weight_fwhm)).items():
+            all_stars = np.full(len(self.used), -1 if value.dtype.kind in "iu" else np.nan, dtype=value.dtype)
+            all_stars[self.used] = value
+            values[name] = all_stars
+        return Shapes(**values)
 
     @property
     def sigma_e(self) -> np.ndarray:

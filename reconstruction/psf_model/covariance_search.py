@@ -192,10 +192,12 @@ class SecondOrder:
     def step(self, free: np.ndarray, damping: np.ndarray) -> np.ndarray:
         """Return Newton's steps of the variables that are free, [n, k], with so much of the diagonal added [n]."""
         both, unit = free[:, :, None] & free[:, None], np.eye(free.shape[1])
-        curvature, expected = (np.where(both, matrix, unit) for matrix in (self.curvature, self.expected))
-        bowl = np.linalg.eigvalsh(curvature)[:, 0] > _LEAST_CURVATURE
-        matrices = np.where(bowl[:, None, None], curvature, expected)
-        matrices = matrices * (1.0 + damping[:, None, None] * unit)
+        matrices = np.where(both, self.curvature, unit)
+        bowl = np.linalg.eigvalsh(matrices)[:, 0] > _LEAST_CURVATURE
+        if not bowl.all():
+            matrices = np.where(bowl[:, None, None], matrices, np.where(both, self.expected, unit))
+        if damping.any():
+            matrices = matrices * (1.0 + damping[:, None, None] * unit)
         return np.asarray(-np.linalg.solve(matrices, np.where(free, self.slope, 0.0)[:, :, None])[:, :, 0])
 
 
@@ -228,8 +230,8 @@ class Posterior:
     colour_count: int = 0  #: terms at the end that are of the colours
 
     def kernels(self, logarithms: np.ndarray, present: np.ndarray) -> np.ndarray:
-        """Return the columns [..., n_columns], those that are not present as 0 but for the length."""
-        return np.where(present | (np.arange(present.shape[-1]) == LENGTH), np.exp(logarithms), 0.0)
+        """Return the columns [..., n_columns], those that are not present as 0."""
+        return np.where(present, np.exp(logarithms), 0.0)
 
     def negative_log_posterior(self, logarithms: np.ndarray, present: np.ndarray) -> SecondOrder:
         """Return minus the logarithms of the posterior of forms, but for a constant, to second order.
@@ -242,17 +244,17 @@ class Posterior:
         # A change dC of the covariance changes the value by half the sum of count C^-1 - C^-1 y y' C^-1 times dC. The
         # second derivative by two of them has the expected part count/2 tr(C^-1 dC C^-1 dC'), and without what the
         # values are expected to be y' C^-1 dC C^-1 dC' C^-1 y less that.
-        changes = self._changes_with_process(kernels, trend) if present[0, 0] else self._changes(kernels, trend)
+        changes = self._changes_with_process(kernels) if present[0, 0] else self._changes(kernels, trend)
         count, first = self.numbers.shape[1], PROCESS_COLUMNS - changes.slope.shape[1]
         before_trend = slice(first, PROCESS_COLUMNS)
         between = self.values_and_terms.T @ changes.solved
         of_values, of_terms = between[:, count:, :count], between[:, count:, count:]
         products = of_values @ of_values.transpose(0, 2, 1)
-        away = np.where(present, (logarithms - self.middle) / self.width, 0.0)
+        away, prior = logarithms - self.middle, present * self.width**-2.0
         value = 0.5 * (
             np.einsum("mkk->m", between[:, :count, :count])
             + count * changes.log_determinant
-            + np.einsum("mc,mc->m", away, away)
+            + np.einsum("mc,mc,mc->m", away, away, prior)
         )
         of_trend = count * np.einsum("maa->ma", of_terms) - np.einsum("maa->ma", products)
         slope = (0.5 * trend * of_trend) @ self.to_columns
@@ -273,12 +275,11 @@ class Posterior:
             curvature[:, LENGTH, LENGTH] += 0.5 * changes.bend - 2.0 * slope[:, LENGTH]
             curvature[:, 0, LENGTH] += slope[:, LENGTH]
             curvature[:, LENGTH, 0] += slope[:, LENGTH]
-        prior = np.where(present, self.width**-2.0, 0.0)
         for matrix in (expected, curvature):
             _diagonals(matrix)[:] += prior
-        return SecondOrder(value, slope + away / self.width, curvature, expected)
+        return SecondOrder(value, slope + away * prior, curvature, expected)
 
-    def _changes_with_process(self, kernels: np.ndarray, trend: np.ndarray) -> _Changes:
+    def _changes_with_process(self, kernels: np.ndarray) -> _Changes:
         """Return what changes by the first three columns of kernels with a process: its variance, length, and noise."""
         count, common = self.numbers.shape[1], kernels[:, _NOISE]
         ratio = self.distance / kernels[:, LENGTH, None, None]
@@ -287,7 +288,8 @@ class Posterior:
         decay = np.multiply(kernels[:, 0, None, None], np.exp(-ratio), out=changes[:, 1])
         np.multiply(decay, ratio, out=changes[:, 2])
         np.multiply(changes[:, 2], ratio, out=changes[:, 0])
-        inverse, log_determinant = _inverses(with_trend_and_noise(decay, kernels, self.terms, self.noise, trend))
+        beside_process = (kernels @ self.covariance_by_columns).reshape(decay.shape)
+        inverse, log_determinant = _inverses(decay + beside_process + self.fixed_covariance)
         solved = inverse @ self.values_and_terms
         changed = np.empty((len(kernels), 4, *self.values_and_terms.shape))
         np.matmul(changes, solved[:, None], out=changed[:, :3])
@@ -337,6 +339,20 @@ class Posterior:
         return np.hstack([self.numbers, self.terms])
 
     @cached_property
+    def fixed_covariance(self) -> np.ndarray:
+        """Covariance that does not depend on kernels, of the constant and the noise of the stars, [n, n]."""
+        none = np.zeros(len(self.middle))
+        trend = trend_variances(none, self.terms.shape[1], self.colour_count)
+        return with_trend_and_noise(np.zeros(self.distance.shape), none, self.terms, self.noise, trend)
+
+    @cached_property
+    def covariance_by_columns(self) -> np.ndarray:
+        """Covariance for a unit of each column of a kernel, but for those of the process, [n_columns, n n]."""
+        by_columns = (self.terms * self.to_columns.T[:, None]) @ self.terms.T
+        by_columns[_NOISE] = np.eye(len(self.noise))
+        return by_columns.reshape(len(by_columns), -1)
+
+    @cached_property
     def to_columns(self) -> np.ndarray:
         """Which column of a kernel is the variance of each term, 1 or 0, [n_terms, n_columns]."""
         columns = columns_of_terms(self.terms.shape[1], self.colour_count)
@@ -360,34 +376,37 @@ class Posterior:
         """
         low, high = self.middle - _REACH, self.middle + _REACH
         varied = present & ~(fixed_length & (np.arange(present.shape[1]) == LENGTH))
-        logarithms = np.where(varied, np.clip(starts, low, high), starts)
-        best = self.negative_log_posterior(logarithms, present)
-        damping, moving = np.zeros(len(starts)), np.arange(len(starts))
-        most = np.broadcast_to(largest, damping.shape)
-        same_form = (present[:, None] == present).all(axis=2) & ~np.eye(len(present), dtype=bool)
+        at = np.where(varied, np.clip(starts, low, high), starts)
+        here, damping, searches = self.negative_log_posterior(at, present), np.zeros(len(at)), np.arange(len(at))
+        logarithms, values, most = at.copy(), here.value.copy(), np.broadcast_to(largest, len(at))
+        same_form = (present[:, None] == present).all(axis=2) & ~np.eye(len(at), dtype=bool)
         for _ in range(_MOST_STEPS):
-            if same_form.any() and len(moving):
-                beside = np.abs(logarithms[moving, None] - logarithms).max(axis=2) < _SAME_PLACE
-                beside &= same_form[moving] & (best.value < best.value[moving, None])
-                moving = moving[~beside.any(axis=1)]
-            at, here = logarithms[moving], best.of_forms(moving)
-            free = varied[moving] & ~((at <= low) & (here.slope > 0.0)) & ~((at >= high) & (here.slope < 0.0))
-            step = here.step(free, damping[moving])
+            free = varied & ~((at <= low) & (here.slope > 0.0)) & ~((at >= high) & (here.slope < 0.0))
+            step = here.step(free, damping)
             gain = -0.5 * (here.slope * step).sum(axis=1)
-            going = (gain > _LEAST_GAIN) & (damping[moving] < _MOST_DAMPING)
-            going &= here.value - _SURE * gain < most[moving]
-            moving, at, step = moving[going], at[going], step[going]
-            if not len(moving):
+            going = (gain > _LEAST_GAIN) & (damping < _MOST_DAMPING) & (here.value - _SURE * gain < most)
+            if same_form.any():
+                beside = np.abs(at[:, None] - logarithms).max(axis=2) < _SAME_PLACE
+                going &= ~(beside & same_form & (values < here.value[:, None])).any(axis=1)
+            if not going.any():
                 break
+            if not going.all():
+                at, step, damping, searches = at[going], step[going], damping[going], searches[going]
+                here, varied, present, most = here.of_forms(going), varied[going], present[going], most[going]
+                same_form = same_form[going]
             step *= np.minimum(1.0, _LONGEST_STEP / np.abs(step).max(axis=1, keepdims=True))
-            at = np.where(varied[moving], np.clip(at + step, low, high), at)
-            there = self.negative_log_posterior(at, present[moving])
-            better = there.value < best.value[moving]
-            logarithms[moving[better]] = at[better]
-            best.replace(moving[better], there.of_forms(better))
-            lower = np.where(damping[moving] > _DAMPING, damping[moving] / _DAMPING_FACTOR, 0.0)
-            damping[moving] = np.where(better, lower, np.maximum(_DAMPING_FACTOR * damping[moving], _DAMPING))
-        return logarithms, best.value
+            next_at = np.minimum(np.maximum(at + step, low), high)
+            there = self.negative_log_posterior(next_at, present)
+            better = there.value < here.value
+            if better.all():
+                at, here = next_at, there
+            else:
+                at = np.where(better[:, None], next_at, at)
+                here.replace(better, there.of_forms(better))
+            lower = np.where(damping > _DAMPING, damping / _DAMPING_FACTOR, 0.0)
+            damping = np.where(better, lower, np.maximum(_DAMPING_FACTOR * damping, _DAMPING))
+            logarithms[searches], values[searches] = at, here.value
+        return logarithms, values
 
 
 def _inverses(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -163,15 +163,19 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
             shape_differences = differences(numbers) @ self.fields.response
             return shape_differences + residuals_left_out(residuals, self.fields, signal, noise)
 
-    def left_out(self, parts: list[np.ndarray], coefficients: np.ndarray) -> np.ndarray | None:
+    @property
+    def predicts_left_out(self) -> bool:
+        """Whether the components are pixels: principal ones hold the stars that are left out."""
+        return self.fields is not None and self.weights is not None
+
+    def left_out(self, parts: list[np.ndarray], coefficients: np.ndarray) -> np.ndarray:
         """Return predictions of all stars, each part of them by the others; arguments as those of the base class.
 
         Covariances, the response of the pixels to the shape, and the noise are those of all stars, as in
-        :meth:`leave_one_out`; the search for them is most of a fit's time. None where the components are not pixels:
-        principal ones hold the stars that are left out.
+        :meth:`leave_one_out`; the search for them is most of a fit's time.
         """
-        if self.fields is None or self.weights is None:
-            return None
+        assert self.fields is not None
+        assert self.weights is not None
         points = mapped(self.positions, self.extent)
         noise, terms = 1.0 / self.weights, self.terms()
         colour_count = 0 if self.colour is None else len(self.colour.slope)
