@@ -7,11 +7,11 @@ weight for both. In turns, both fit the same four fifths of the stars and predic
 without options, Piff by PixelGrid with pixels of the image's scale and BasisPolynomial, with the inverse variance of
 the sky as weights. At each star that was held out the flux and the centre of either model are fitted to the good pixels
 within 10 pixels, with the noise of sky and star; chi-square a pixel is that of the residual. e and T are those of star
-and model under the same weight. Errors are those of the mean over stars, of each star's mean over the seeds. Times are
-of one thread, of the processor: `fit_own_stars` selects and centres stars, and predicts each fifth of them by the
-others besides; `PsfModel.fit` makes one model, as Piff does. Ratios are medians over the splits, of fits in turns: to
-one fit of Piff at the order that is its best by a figure, which nobody knows beforehand, and to its fits at all orders,
-as our model chooses its own.
+and model under the same weight. Errors are those of the mean over stars, of each star's mean over the seeds. Times
+are of one thread, of the processor: `fit_own_stars` selects and centres stars besides, and predicts each fifth of
+them by the others only when that is read; `PsfModel.fit` makes one model, as Piff does. Ratios are medians over the
+splits, of fits in turns: to one fit of Piff at the order that is its best by a figure, which nobody knows beforehand,
+and to its fits at all orders, as our model chooses its own.
 """
 
 import argparse

@@ -116,7 +116,7 @@ def launch(
     if count == 0:
         return
     load_kernels(kernel, device)
-    slices = min(thread_count(threads), count) if device == "cpu" else 1
+    slices = min(thread_count(threads), count) if device == "cpu" and threads != 1 else 1
 
     def run(i: int) -> None:
         first, end = (count * k // slices for k in (i, i + 1))

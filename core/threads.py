@@ -6,7 +6,7 @@ import os
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import lru_cache
 
 from threadpoolctl import ThreadpoolController
@@ -29,8 +29,8 @@ def thread_count(threads: int | None) -> int:
 
 @lru_cache(maxsize=1)
 def _libraries(modules: int) -> ThreadpoolController:
-    """Return the libraries in memory. Finding them takes a millisecond; new ones come with new modules."""
-    return ThreadpoolController()
+    """Return the BLAS libraries in memory. Finding them takes a millisecond; new ones come with new modules."""
+    return ThreadpoolController().select(user_api="blas")
 
 
 @contextmanager
@@ -41,5 +41,9 @@ def one_blas_thread() -> Iterator[None]:
     the small matrices here they are no faster. The limit belongs to the process: one block runs at a time, or the end
     of one would lift the limit of another.
     """
-    with _LOCK, _libraries(len(sys.modules)).limit(limits=1, user_api="blas"):
-        yield
+    with _LOCK:
+        libraries = _libraries(len(sys.modules))
+        on_one_thread = all(library.num_threads == 1 for library in libraries.lib_controllers)
+        # In a block inside another one there is nothing to change; a limit costs a tenth of a millisecond.
+        with nullcontext() if on_one_thread else libraries.limit(limits=1):
+            yield

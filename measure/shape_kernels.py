@@ -8,23 +8,22 @@ from __future__ import annotations
 import warp as wp
 
 from ..core.launch import FORWARD_OPTIONS
+from .adaptive_kernels import CENTROID_LEFT_STAMP, NEGATIVE_MOMENTS, NO_FLUX, NOT_CONVERGED
+from .packet_kernels import LANES, lane_sum, packet
 
 wp.set_module_options(FORWARD_OPTIONS)
 
-#: Columns of one packet.
-LANES = 8
-#: Numbers of an image: centre x, y; mean x, y, xx, yy, xy of weight times image about it [pixel].
-MOMENTS = 7
+#: Numbers of an image: centre x, y [pixel]; e1, e2; size [pixel].
+SHAPE = 5
 #: Rows of work space: the weight along x, times x and times its square.
 WEIGHT_ROWS = 3
 
-NOT_CONVERGED = wp.constant(wp.int32(1))
-CENTROID_LEFT_STAMP = wp.constant(wp.int32(4))
-NO_FLUX = wp.constant(wp.int32(8))
+NO_SOURCE = wp.constant(wp.int32(32))
 #: Least eigenvalue of the derivative of the first moment by the centre, of 1 without a source.
 LEAST_SLOPE = wp.constant(wp.float64(0.1))
 
-packet = wp.types.vector(LANES, wp.float64)
+#: Size under the weight, in units of that of the weight, from which on light does not fall off: 22 times as wide.
+WIDEST = wp.constant(wp.float64(0.999))
 
 
 @wp.struct
@@ -37,15 +36,6 @@ class WeightedMoments:
     xx: wp.float64
     yy: wp.float64
     xy: wp.float64
-
-
-@wp.func
-def lane_sum(values: packet) -> wp.float64:
-    """Sum over the columns of a packet."""
-    total = wp.float64(0.0)
-    for lane in range(LANES):
-        total = total + values[lane]
-    return total
 
 
 @wp.func
@@ -143,7 +133,7 @@ def newton_step(moments: WeightedMoments, sigma: wp.float64) -> wp.vec2d:
 
 
 @wp.kernel
-def centre_weights(
+def measure_shape(
     first: wp.int32,
     images: wp.array3d(dtype=packet),
     half_x: wp.float64,
@@ -155,10 +145,10 @@ def centre_weights(
     results: wp.array2d(dtype=wp.float64),
     flags: wp.array(dtype=wp.int32),
 ):
-    """Iterate the centre of the weight of one image whose flag is zero, from that in `results`.
+    """Iterate the centre of the weight of one image whose flag is zero, from that in `results`, and measure its shape.
 
     Arguments: images [n, ny, packet] with zeros beyond their columns; half of (nx - 1) and (ny - 1); rms width of the
-    weight [pixel]; work space [n, 3, packet]; results [n, MOMENTS].
+    weight [pixel]; work space [n, 3, packet]; results [n, SHAPE], of which those stay as they are that fail.
     """
     item = first + wp.tid()
     if flags[item] != wp.int32(0):
@@ -183,17 +173,27 @@ def centre_weights(
             elif wp.length(step) < tolerance:
                 flag = wp.int32(0)
         iteration = iteration + wp.int32(1)
-    flags[item] = flag
     if flag == wp.int32(0):
-        # Once more about the final centre: the moments of the last pass belong to the centre before its step.
-        moments = weigh_image(images[item], weights[item], x0, y0, half_y, half_x, sigma)
         results[item, 0] = x0
         results[item, 1] = y0
-        results[item, 2] = moments.x
-        results[item, 3] = moments.y
-        results[item, 4] = moments.xx
-        results[item, 5] = moments.yy
-        results[item, 6] = moments.xy
+        # Once more about the final centre: the moments of the last pass belong to the centre before its step.
+        moments = weigh_image(images[item], weights[item], x0, y0, half_y, half_x, sigma)
+        q11 = moments.xx - moments.x * moments.x
+        q22 = moments.yy - moments.y * moments.y
+        q12 = moments.xy - moments.x * moments.y
+        determinant = q11 * q22 - q12 * q12
+        widest = WIDEST * sigma
+        if not (determinant > wp.float64(0.0) and q11 > wp.float64(0.0)):
+            flag = NEGATIVE_MOMENTS
+        elif determinant > widest * widest * widest * widest:
+            flag = NO_SOURCE
+        else:
+            root = wp.sqrt(determinant)
+            trace = q11 + q22 + wp.float64(2.0) * root
+            results[item, 2] = (q11 - q22) / trace
+            results[item, 3] = wp.float64(2.0) * q12 / trace
+            results[item, 4] = wp.sqrt(root)
+    flags[item] = flag
 
 
 @wp.func

@@ -13,7 +13,6 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.arguments import check_arguments
@@ -23,17 +22,15 @@ from ..core.point_plots import draw_shapes
 from ..core.result import Result
 from ..core.threads import one_blas_thread
 from ..core.units import ARCSEC, positive_angle, pure_numbers, real_numbers, require_positive
-from ..core.warp_arrays import warp_array
 from .masked_moments import MaskedMoments, fill_by_moments
+from .packet_kernels import LANES
 from .pixel_masks import bad_pixels, weightless_pixels
-from .shape_kernels import LANES, MOMENTS, WEIGHT_ROWS, add_areas, centre_weights, packet
+from .shape_kernels import SHAPE, WEIGHT_ROWS, add_areas, measure_shape
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Size under the weight, in units of that of the weight, from which on light does not fall off: 22 times as wide.
-_WIDEST = 0.999
 #: Most images of one call: more would take days.
 _MOST_IMAGES = 10**8
 # Rows and columns on which the spans of bright pixels begin and end.
@@ -197,6 +194,8 @@ def measure_shapes(
     if not parts:
         no_values = np.empty(0)
         return Shapes(no_values, no_values, no_values, no_values, no_values, no_values, np.empty(0, dtype=np.int32))
+    if len(parts) == 1:
+        return parts[0]
     return Shapes(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Shapes)})
 
 
@@ -265,36 +264,21 @@ def _measure_batch(
     with np.errstate(invalid="ignore"):  # infinities of both signs
         flux = images.reshape(count, -1).sum(axis=1)
     flags[~np.isfinite(flux)] |= ShapeFlag.NO_FLUX
-    moments = np.zeros((count, MOMENTS))
-    if starts is not None:
-        moments[:, :2] = starts
+    results = np.full((count, SHAPE), np.nan)
+    results[:, :2] = 0.0 if starts is None else starts
     pixels = np.zeros((count, ny, -(-nx // LANES) * LANES))
     pixels[:, :, :nx] = images
     pixels = pixels.reshape(count, ny, -1, LANES)
-    work_space = np.empty((count, WEIGHT_ROWS, *pixels.shape[2:]))
-    arrays = [warp_array(work_space, packet), warp_array(moments), warp_array(flags, wp.int32)]
     options = [(nx - 1) / 2.0, (ny - 1) / 2.0, sigma, max_iterations, tolerance]
-    launch(centre_weights, count, [warp_array(pixels, packet), *options, *arrays], threads=1)
-    moments[flags != 0, :2] = np.nan
-    center = moments[:, :2]
-    measured = np.flatnonzero(flags == 0)
-    first, second = moments[measured, 2:4], moments[measured, 4:]
-    q11 = second[:, 0] - first[:, 0] ** 2
-    q22 = second[:, 1] - first[:, 1] ** 2
-    q12 = second[:, 2] - first[:, 0] * first[:, 1]
-    determinant = q11 * q22 - q12**2
-    good = (determinant > 0.0) & (q11 > 0.0)
-    flags[measured[~good]] |= ShapeFlag.NEGATIVE_MOMENTS
-    endless = (determinant > _WIDEST**4 * sigma**4) | _rises_to_an_edge(images, measured, center, sigma)
-    flags[measured[endless & good]] |= ShapeFlag.NO_SOURCE
-    good &= ~endless
-    e1, e2, size = (np.full(count, np.nan) for _ in range(3))
-    root = np.sqrt(determinant[good])
-    trace = q11[good] + q22[good] + 2.0 * root
-    e1[measured[good]] = (q11[good] - q22[good]) / trace
-    e2[measured[good]] = 2.0 * q12[good] / trace
-    size[measured[good]] = np.sqrt(root) * scale
-    return Shapes(e1, e2, size, flux, center[:, 0], center[:, 1], flags)
+    work_space = np.empty((count, WEIGHT_ROWS, *pixels.shape[2:]))
+    launch(measure_shape, count, [pixels, *options, work_space, results, flags], threads=1)
+    centered = (flags & ~(ShapeFlag.NEGATIVE_MOMENTS | ShapeFlag.NO_SOURCE)) == 0
+    results[~centered, :2] = np.nan
+    endless = _rises_to_an_edge(images, np.flatnonzero(flags == 0), results[:, :2], sigma)
+    flags[endless] = ShapeFlag.NO_SOURCE
+    results[endless, 2:] = np.nan
+    x, y, e1, e2, size = results.T.copy()
+    return Shapes(e1, e2, size * scale, flux, x, y, flags)
 
 
 def _measure_masked(
@@ -317,20 +301,21 @@ def _measure_masked(
 
 
 def _rises_to_an_edge(images: np.ndarray, measured: np.ndarray, centers: np.ndarray, sigma: float) -> np.ndarray:
-    """Return whether an edge within two rms widths of the weight is brighter than the mean under it, [n_measured]."""
-    rises, center = np.zeros(len(measured), dtype=bool), centers[measured]
+    """Return the measured images that are brighter at an edge within two rms widths of the weight than under it."""
     reach = 2.0 * sigma
     half = 0.5 * np.array([images.shape[2] - 1.0, images.shape[1] - 1.0])
-    for i in np.flatnonzero((np.abs(center) > half - reach).any(axis=1)):
-        offsets = [np.arange(2.0 * h + 1.0) - h - c for h, c in zip(half, center[i], strict=True)]
+    near_edges = measured[(np.abs(centers[measured]) > half - reach).any(axis=1)]
+    rises = np.zeros(len(near_edges), dtype=bool)
+    for i, image_index in enumerate(near_edges):
+        offsets = [np.arange(2.0 * h + 1.0) - h - c for h, c in zip(half, centers[image_index], strict=True)]
         weights = [np.exp(-0.5 * (offset / sigma) ** 2) for offset in offsets]
         weight_x, weight_y = (weight / weight.sum() for weight in weights)
-        image = images[measured[i]]
+        image = images[image_index]
         columns, rows = weight_y @ image, image @ weight_x
         mean = columns @ weight_x
         for line, offset in ((columns, offsets[0]), (rows, offsets[1])):
             rises[i] |= any(abs(offset[end]) < reach and line[end] > mean for end in (0, -1))
-    return rises
+    return np.asarray(near_edges[rises])
 
 
 @lru_cache(maxsize=8)
@@ -356,8 +341,8 @@ def _bright_spans(images: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     for axis in (2, 1):
         lit, count = bright.any(axis=axis), images.shape[3 - axis]
         first, last = lit.argmax(axis=1), count - 1 - lit[:, ::-1].argmax(axis=1)
-        bounds.append(np.maximum((first - 2) // _SPAN_STEP * _SPAN_STEP, 0))
-        bounds.append(np.minimum(-(-(last + 3) // _SPAN_STEP) * _SPAN_STEP, count))
+        bounds.append(np.maximum((first - 1) // _SPAN_STEP * _SPAN_STEP, 0))
+        bounds.append(np.minimum(-(-(last + 2) // _SPAN_STEP) * _SPAN_STEP, count))
     return np.stack(bounds, axis=1)
 
 
@@ -388,7 +373,7 @@ def _interpolated_peaks(fine: np.ndarray) -> np.ndarray:
 def _areas_above(fine: np.ndarray, levels: np.ndarray) -> np.ndarray:
     """Return the areas of images above levels [n], in pixels; border pixels count in part, as if planes there."""
     areas = np.empty(len(fine))
-    launch(add_areas, len(fine), [warp_array(fine), warp_array(levels), warp_array(areas)], threads=1)
+    launch(add_areas, len(fine), [fine, levels, areas], threads=1)
     return areas
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
@@ -129,27 +131,35 @@ def center_stamps(
         offsets = np.stack([np.broadcast_to(values, (count,)) for values in centroids], axis=1)
     except ValueError as error:
         raise DomainError(f"x and y have shapes {np.shape(x)} and {np.shape(y)}: expected {count} centroids") from error
-    rows, columns = _middle_pixels(size, (ny, nx))
-    middle = np.array([nx // 2 - (nx - 1) / 2.0, ny // 2 - (ny - 1) / 2.0])
     bad = weightless_pixels(stack, weights)
     masked = bad.any(axis=(1, 2))
     if masked.any():
         stack = fill_symmetric(stack, bad, offsets[:, 0], offsets[:, 1])
-    result = np.full((count, size, size), np.nan)
-    placed = np.flatnonzero(np.isfinite(offsets).all(axis=1))
-    for first in range(0, len(placed), _SHIFTED_TOGETHER):
-        indices = placed[first : first + _SHIFTED_TOGETHER]
-        dx, dy = (middle - offsets[indices]).T
-        shifted = fourier_shifts(stack[indices], dx, dy, rows, columns)
-        if normalize:
-            total = shifted.reshape(len(indices), -1).sum(axis=1)
-            shifted /= np.where(total > 0.0, total, np.nan)[:, None, None]
-        result[indices] = shifted
+    result = shift_to_middle(stack, offsets, size)
+    if normalize:
+        total = result.reshape(count, -1).sum(axis=1)
+        result /= np.where(total > 0.0, total, np.nan)[:, None, None]
     if masked.any():
         result[masked] = np.where(
             center_masks(bad[masked], offsets[masked, 0], offsets[masked, 1], size), np.nan, result[masked]
         )
     return result
+
+
+def shift_to_middle(images: np.ndarray, offsets: np.ndarray, size: int) -> np.ndarray:
+    """Return stamps of finite images as of :func:`center_stamps`, [n, size, size]; NaN where the offset is.
+
+    `offsets` [n, 2] are x and y from the centre of the image.
+    """
+    ny, nx = images.shape[1:]
+    rows, columns = _middle_pixels(size, (ny, nx))
+    middle = np.array([nx // 2 - (nx - 1) / 2.0, ny // 2 - (ny - 1) / 2.0])
+    stamps = np.full((len(images), size, size), np.nan)
+    placed = np.flatnonzero(np.isfinite(offsets).all(axis=1))
+    for first in range(0, len(placed), _SHIFTED_TOGETHER):
+        indices = placed[first : first + _SHIFTED_TOGETHER]
+        stamps[indices] = fourier_shifts(images[indices], *(middle - offsets[indices]).T, rows, columns)
+    return stamps
 
 
 def center_masks(masks: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> np.ndarray:
@@ -240,10 +250,12 @@ def fourier_shifts(
     `images` are [n, ny, nx], or one [ny, nx] that is moved to n places. The sums with periodic sincs along both axes
     are a fraction of the work of a transform of a small image.
     """
-    along_y, along_x = (
-        _shift_matrices(count, shift, lines)
-        for count, shift, lines in zip(images.shape[-2:], (dy, dx), (rows, columns), strict=True)
-    )
+    (ny, nx), count = images.shape[-2:], len(dx)
+    if (ny, rows) == (nx, columns):
+        along_both = _shift_matrices(ny, np.concatenate([dy, dx]), rows)
+        along_y, along_x = along_both[:count], along_both[count:]
+    else:
+        along_y, along_x = _shift_matrices(ny, dy, rows), _shift_matrices(nx, dx, columns)
     with one_blas_thread():
         return np.asarray(along_y @ images @ along_x.transpose(0, 2, 1))
 
@@ -255,19 +267,25 @@ def _shift_matrices(count: int, shifts: np.ndarray, lines: slice) -> np.ndarray:
     """
     whole = np.rint(shifts)
     part = (shifts - whole)[:, None]
-    steps = np.arange(count)
-    steps[steps > count // 2] -= count
+    steps, signs, differences = _line_steps(count)
     turn = np.pi * (steps - part) / count
     sine = np.sin(turn)
     below = count * (sine if count % 2 else np.tan(turn))
-    sinc = np.sin(np.pi * part) * (2.0 * (steps % 2) - 1.0)
-    sinc = np.divide(sinc, below, out=np.ones(turn.shape), where=np.abs(sine) >= 1e-12)
+    sinc = np.divide(np.sin(np.pi * part) * signs, below, out=np.ones(turn.shape), where=np.abs(sine) >= 1e-12)
     # The pixel at `to` gets that at `of` times the periodic sinc of to - of less the shift.
-    around = (np.arange(1 - count, count) - (whole % count).astype(int)[:, None]) % count
+    around = (differences - (whole % count).astype(int)[:, None]) % count
     line = sinc[np.arange(len(shifts))[:, None], around][:, count - 1 :]
     strides = (*line.strides, -line.strides[1])
     to_of = np.lib.stride_tricks.as_strided(line, (len(shifts), count, count), strides, writeable=False)
     return np.ascontiguousarray(to_of[:, lines])
+
+
+@lru_cache(maxsize=8)
+def _line_steps(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return periodic steps along a line of pixels [count], the signs of the sinc there, and differences of pixels."""
+    steps = np.arange(count)
+    steps[steps > count // 2] -= count
+    return steps, 2.0 * (steps % 2) - 1.0, np.arange(1 - count, count)
 
 
 def _stamp_cube(images: ArrayLike, name: str) -> np.ndarray:

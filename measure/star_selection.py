@@ -11,6 +11,7 @@ from scipy import fft, ndimage
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
+from ..core.statistics import median_image, row_medians
 from ..core.units import pure_numbers, real_array
 from .masked_moments import MOST_MASKED
 from .pixel_masks import bad_pixels, fill_symmetric
@@ -170,11 +171,11 @@ def flag_stars(
     usable_indices = np.flatnonzero(usable)
     light = scales[usable, None, None] * star
     residuals = images[usable] - light
-    photon_variances = rms[usable, None, None] ** 2 + np.maximum(light, 0.0) / gain
-    variances = photon_variances + (scales[usable, None, None] * allowance) ** 2
+    fluxes, sky_variances, photons = scales[usable], rms[usable] ** 2, np.maximum(star, 0.0) / gain
+    photon_variances = sky_variances[:, None, None] + fluxes[:, None, None] * photons
+    variances = photon_variances + (fluxes[:, None, None] * allowance) ** 2
     sharp_pixels = _sharp_pixels(residuals, variances, fraction, threshold)
     matched_filter = MatchedFilter.of(star)
-    fluxes = scales[usable]
     core_error = np.sqrt(photon_variances[:, core].sum(axis=1)) / (fluxes * star[core].sum())
     unsure = np.hypot(core_error, _scale_errors(photon_variances[:, wings], star[wings]) / fluxes)
     saturated = lack[usable] > np.maximum(_LOSS, threshold * unsure)
@@ -189,7 +190,11 @@ def flag_stars(
     flags[usable_indices[compared[hit]]] |= StarFlag.COSMIC_RAY
     masks[usable_indices[compared]] = sharp_pixels[compared]
     residuals = np.where(sharp_pixels, 0.0, residuals)
-    light, squares = matched_filter.light(residuals[compared]), matched_filter.squares(variances[compared])
+    light = matched_filter.light(residuals[compared])
+    # The variances are sums of three images.
+    of_photons, of_allowance = matched_filter.squares(np.stack([photons, allowance**2]))
+    flux = fluxes[compared, None, None]
+    squares = sky_variances[compared, None, None] * matched_filter.norm + flux * of_photons + flux**2 * of_allowance
     significant = (light / np.sqrt(squares)).max(axis=(1, 2), initial=0.0) > threshold
     for place, of_variance in zip(compared[significant], squares[significant], strict=True):
         neighbours = _neighbour_pixels(
@@ -203,11 +208,11 @@ def flag_stars(
 
 def _median_star(images: np.ndarray) -> np.ndarray:
     """Return the median of the stars scaled to their own bright pixels, of unit sum."""
-    star = np.median(images / images.sum(axis=(1, 2), keepdims=True), axis=0)
+    star = median_image(images / images.sum(axis=(1, 2), keepdims=True))
     bright = star > 0.2 * star.max()
-    scale = np.median(images[:, bright] / star[bright], axis=1)
+    scale = row_medians(images[:, bright] / star[bright])
     good = scale > 0.0
-    star = np.median(images[good] / scale[good, None, None], axis=0)
+    star = median_image(images[good] / scale[good, None, None])
     return star / star.sum()
 
 
@@ -239,7 +244,7 @@ def _scales(wings: np.ndarray, star: np.ndarray, bad: np.ndarray) -> np.ndarray:
     """Return the median ratio of the stars' pixels [n, n_wings] to the median star's; NaN where all are bad."""
     ratios = wings / star
     if not bad.any():
-        return np.asarray(np.median(ratios, axis=1))
+        return row_medians(ratios)
     ratios[bad] = np.nan
     scales, some_good = np.full(len(wings), np.nan), ~bad.all(axis=1)
     scales[some_good] = np.nanmedian(ratios[some_good], axis=1)

@@ -11,25 +11,13 @@ from __future__ import annotations
 import warp as wp
 
 from ...core.launch import CPU_COMPILER_FLAGS, FORWARD_OPTIONS
+from ..packet_kernels import LANES, lane_sum, packet
 
 # Products and sums fused take a fifth less time.
 wp.set_module_options(FORWARD_OPTIONS | {"cpu_compiler_flags": CPU_COMPILER_FLAGS + " -ffp-contract=fast"})
 
-#: Pixels side by side. The sides of stamps are multiples of twice that.
-LANES = 8
 #: Numbers in a row of normal equations: chi-square, 6 of the right-hand side, 21 of the upper triangle of the matrix.
 SUMS = 28
-
-pixels = wp.types.vector(LANES, wp.float64)
-
-
-@wp.func
-def total(values: pixels):
-    """Sum over the lanes, in order."""
-    result = wp.float64(0.0)
-    for i in range(LANES):
-        result = result + values[i]
-    return result
 
 
 @wp.func
@@ -39,11 +27,11 @@ def transform_columns(
     step: wp.float64,
     params: wp.array2d(dtype=wp.float64),
     galaxy: wp.int32,
-    cosine: wp.array2d(dtype=pixels),
-    sine: wp.array2d(dtype=pixels),
+    cosine: wp.array2d(dtype=packet),
+    sine: wp.array2d(dtype=packet),
     row: wp.int32,
     spectrum: wp.array(dtype=wp.vec4d),
-    columns: wp.array3d(dtype=pixels),
+    columns: wp.array3d(dtype=packet),
 ):
     """Sum the model and its first two derivatives along y over ky, for every kx and y.
 
@@ -88,18 +76,18 @@ def transform_columns(
             phase_i = phase * lean_y + phase_i * turn_y
             phase = turned
         for p in range(packets):
-            even_r = pixels()
-            even_i = pixels()
-            odd_r = pixels()
-            odd_i = pixels()
-            even1_r = pixels()
-            even1_i = pixels()
-            odd1_r = pixels()
-            odd1_i = pixels()
-            even2_r = pixels()
-            even2_i = pixels()
-            odd2_r = pixels()
-            odd2_i = pixels()
+            even_r = packet()
+            even_i = packet()
+            odd_r = packet()
+            odd_i = packet()
+            even1_r = packet()
+            even1_i = packet()
+            odd1_r = packet()
+            odd1_i = packet()
+            even2_r = packet()
+            even2_i = packet()
+            odd2_r = packet()
+            odd2_i = packet()
             for j in range(count):
                 ky = step * wp.float64(j)
                 value = spectrum[row + j]
@@ -132,17 +120,17 @@ def transform_columns(
 
 @wp.func
 def store(
-    columns: wp.array3d(dtype=pixels),
+    columns: wp.array3d(dtype=packet),
     at: wp.int32,
     channel: wp.int32,
     p: wp.int32,
     packets: wp.int32,
     phase: wp.float64,
     phase_i: wp.float64,
-    even_r: pixels,
-    even_i: pixels,
-    odd_r: pixels,
-    odd_i: pixels,
+    even_r: packet,
+    even_i: packet,
+    odd_r: packet,
+    odd_i: packet,
 ):
     """Write a transform at a packet of rows above the centre and at their mirror images, shifted along x."""
     real = even_r + odd_r
@@ -161,23 +149,23 @@ def transform_row(
     row: wp.int32,
     step: wp.float64,
     y: wp.int32,
-    cosine: wp.array2d(dtype=pixels),
-    sine: wp.array2d(dtype=pixels),
+    cosine: wp.array2d(dtype=packet),
+    sine: wp.array2d(dtype=packet),
     p: wp.int32,
 ):
     """Even and odd parts of model, d/dx, d/dy, d2/dx2, d2/dxdy and d2/dy2 along a packet of a row."""
-    even = pixels()
-    odd = pixels()
-    even_x = pixels()
-    odd_x = pixels()
-    even_y = pixels()
-    odd_y = pixels()
-    even_xx = pixels()
-    odd_xx = pixels()
-    even_xy = pixels()
-    odd_xy = pixels()
-    even_yy = pixels()
-    odd_yy = pixels()
+    even = packet()
+    odd = packet()
+    even_x = packet()
+    odd_x = packet()
+    even_y = packet()
+    odd_y = packet()
+    even_xx = packet()
+    odd_xx = packet()
+    even_xy = packet()
+    odd_xy = packet()
+    even_yy = packet()
+    odd_yy = packet()
     for i in range(cosine.shape[0]):
         kx = step * wp.float64(i)
         c = cosine[i, p]
@@ -209,12 +197,12 @@ def draw_models(
     templates: wp.array(dtype=wp.int32),
     step: wp.float64,
     params: wp.array2d(dtype=wp.float64),
-    cosine: wp.array2d(dtype=pixels),
-    sine: wp.array2d(dtype=pixels),
+    cosine: wp.array2d(dtype=packet),
+    sine: wp.array2d(dtype=packet),
     spectrum: wp.array(dtype=wp.vec4d),
-    columns: wp.array3d(dtype=pixels),
+    columns: wp.array3d(dtype=packet),
     column_values: wp.array3d(dtype=wp.float64),
-    images: wp.array4d(dtype=pixels),
+    images: wp.array4d(dtype=packet),
 ):
     """Draw one galaxy and its derivatives.
 
@@ -256,12 +244,12 @@ def sum_normal_equations(
     stamps: wp.array(dtype=wp.int32),
     step: wp.float64,
     params: wp.array2d(dtype=wp.float64),
-    cosine: wp.array2d(dtype=pixels),
-    sine: wp.array2d(dtype=pixels),
-    data: wp.array3d(dtype=pixels),
-    weight: wp.array3d(dtype=pixels),
+    cosine: wp.array2d(dtype=packet),
+    sine: wp.array2d(dtype=packet),
+    data: wp.array3d(dtype=packet),
+    weight: wp.array3d(dtype=packet),
     spectrum: wp.array(dtype=wp.vec4d),
-    columns: wp.array3d(dtype=pixels),
+    columns: wp.array3d(dtype=packet),
     column_values: wp.array3d(dtype=wp.float64),
     result: wp.array2d(dtype=wp.float64),
 ):
@@ -284,34 +272,34 @@ def sum_normal_equations(
         transform_columns(psf, templates[galaxy], step, params, galaxy, cosine, sine, row, spectrum, columns)
         flux = params[galaxy, 0]
         stamp = stamps[galaxy]
-        chi2 = pixels()
-        right0 = pixels()
-        right1 = pixels()
-        right2 = pixels()
-        right3 = pixels()
-        right4 = pixels()
-        right5 = pixels()
-        m00 = pixels()
-        m01 = pixels()
-        m02 = pixels()
-        m03 = pixels()
-        m04 = pixels()
-        m05 = pixels()
-        m11 = pixels()
-        m12 = pixels()
-        m13 = pixels()
-        m14 = pixels()
-        m15 = pixels()
-        m22 = pixels()
-        m23 = pixels()
-        m24 = pixels()
-        m25 = pixels()
-        m33 = pixels()
-        m34 = pixels()
-        m35 = pixels()
-        m44 = pixels()
-        m45 = pixels()
-        m55 = pixels()
+        chi2 = packet()
+        right0 = packet()
+        right1 = packet()
+        right2 = packet()
+        right3 = packet()
+        right4 = packet()
+        right5 = packet()
+        m00 = packet()
+        m01 = packet()
+        m02 = packet()
+        m03 = packet()
+        m04 = packet()
+        m05 = packet()
+        m11 = packet()
+        m12 = packet()
+        m13 = packet()
+        m14 = packet()
+        m15 = packet()
+        m22 = packet()
+        m23 = packet()
+        m24 = packet()
+        m25 = packet()
+        m33 = packet()
+        m34 = packet()
+        m35 = packet()
+        m44 = packet()
+        m45 = packet()
+        m55 = packet()
         for y in range(2 * packets * LANES):
             for p in range(packets):
                 e0, o0, ex, ox, ey, oy, exx, oxx, exy, oxy, eyy, oyy = transform_row(
@@ -362,31 +350,31 @@ def sum_normal_equations(
                     m44 += wp.cw_mul(w4, b4)
                     m45 += wp.cw_mul(w4, b5)
                     m55 += wp.cw_mul(w5, b5)
-        result[galaxy, 0] = total(chi2)
-        result[galaxy, 1] = total(right0)
-        result[galaxy, 2] = total(right1)
-        result[galaxy, 3] = total(right2)
-        result[galaxy, 4] = total(right3)
-        result[galaxy, 5] = total(right4)
-        result[galaxy, 6] = total(right5)
-        result[galaxy, 7] = total(m00)
-        result[galaxy, 8] = total(m01)
-        result[galaxy, 9] = total(m02)
-        result[galaxy, 10] = total(m03)
-        result[galaxy, 11] = total(m04)
-        result[galaxy, 12] = total(m05)
-        result[galaxy, 13] = total(m11)
-        result[galaxy, 14] = total(m12)
-        result[galaxy, 15] = total(m13)
-        result[galaxy, 16] = total(m14)
-        result[galaxy, 17] = total(m15)
-        result[galaxy, 18] = total(m22)
-        result[galaxy, 19] = total(m23)
-        result[galaxy, 20] = total(m24)
-        result[galaxy, 21] = total(m25)
-        result[galaxy, 22] = total(m33)
-        result[galaxy, 23] = total(m34)
-        result[galaxy, 24] = total(m35)
-        result[galaxy, 25] = total(m44)
-        result[galaxy, 26] = total(m45)
-        result[galaxy, 27] = total(m55)
+        result[galaxy, 0] = lane_sum(chi2)
+        result[galaxy, 1] = lane_sum(right0)
+        result[galaxy, 2] = lane_sum(right1)
+        result[galaxy, 3] = lane_sum(right2)
+        result[galaxy, 4] = lane_sum(right3)
+        result[galaxy, 5] = lane_sum(right4)
+        result[galaxy, 6] = lane_sum(right5)
+        result[galaxy, 7] = lane_sum(m00)
+        result[galaxy, 8] = lane_sum(m01)
+        result[galaxy, 9] = lane_sum(m02)
+        result[galaxy, 10] = lane_sum(m03)
+        result[galaxy, 11] = lane_sum(m04)
+        result[galaxy, 12] = lane_sum(m05)
+        result[galaxy, 13] = lane_sum(m11)
+        result[galaxy, 14] = lane_sum(m12)
+        result[galaxy, 15] = lane_sum(m13)
+        result[galaxy, 16] = lane_sum(m14)
+        result[galaxy, 17] = lane_sum(m15)
+        result[galaxy, 18] = lane_sum(m22)
+        result[galaxy, 19] = lane_sum(m23)
+        result[galaxy, 20] = lane_sum(m24)
+        result[galaxy, 21] = lane_sum(m25)
+        result[galaxy, 22] = lane_sum(m33)
+        result[galaxy, 23] = lane_sum(m34)
+        result[galaxy, 24] = lane_sum(m35)
+        result[galaxy, 25] = lane_sum(m44)
+        result[galaxy, 26] = lane_sum(m45)
+        result[galaxy, 27] = lane_sum(m55)

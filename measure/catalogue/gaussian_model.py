@@ -21,7 +21,8 @@ from scipy import fft
 from ...core.launch import launch, load_kernels
 from ...core.threads import thread_count
 from ...core.warp_arrays import warp_array
-from .fit_kernels import LANES, SUMS, draw_models, pixels, sum_normal_equations
+from ..packet_kernels import LANES, packet
+from .fit_kernels import SUMS, draw_models, sum_normal_equations
 
 #: Parameters of a galaxy, in order.
 PARAMETERS = ("flux", "x", "y", "Cxx", "Cxy", "Cyy")
@@ -84,9 +85,9 @@ class GaussianStamps:
         self._step = 2.0 * np.pi / self.period
         self._psf = warp_array(_psf_transforms(psf_images, self.period, self.threads).view(np.float64), wp.vec4d)
         self._trigonometric_tables = [
-            warp_array(table, pixels) for table in _trigonometric_tables(self.period, self.side)
+            warp_array(table, packet) for table in _trigonometric_tables(self.period, self.side)
         ]
-        self._data, self._weight = (warp_array(_stamp_packets(values), pixels) for values in (data, weight))
+        self._data, self._weight = (warp_array(_stamp_packets(values), packet) for values in (data, weight))
 
     def normal_equations(self, params: np.ndarray, indices: np.ndarray) -> NormalEquations:
         """Return the normal equations of the galaxies `indices` [k] of given parameters [k, 6]."""
@@ -134,7 +135,7 @@ class GaussianStamps:
                 warp_array(params),
                 *self._trigonometric_tables,
                 *self._work_arrays(count),
-                warp_array(images.reshape(count, len(PARAMETERS), side, -1, LANES), pixels),
+                warp_array(images.reshape(count, len(PARAMETERS), side, -1, LANES), packet),
             ],
             threads=self.threads,
         )
@@ -145,7 +146,7 @@ class GaussianStamps:
         """Return the work arrays of `count` items: spectrum, and columns as packets and as numbers."""
         rows = count * ((self.period + 1) // 2)
         columns = np.zeros((rows, len(PARAMETERS), self.side))
-        as_packets = warp_array(columns.reshape(rows, len(PARAMETERS), -1, LANES), pixels)
+        as_packets = warp_array(columns.reshape(rows, len(PARAMETERS), -1, LANES), packet)
         return [warp_array(np.zeros((rows, 4)), wp.vec4d), as_packets, warp_array(columns)]
 
 

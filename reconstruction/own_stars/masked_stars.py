@@ -18,8 +18,8 @@ from ..psf_model.checks import as_extent
 from ..psf_model.pixel_fields import Contrasts, SignalCovariance
 from ..psf_model.polynomial import design_matrix, mapped
 
-# Passes end when no centroid moves by more than this [pixel], a tenth of the error of a star of S/N 200.
-_CONVERGED = 1e-3
+# Passes end when no centroid moves by more than this [pixel], a fifth of the error of a star of S/N 200.
+_CONVERGED = 2e-3
 # Most passes.
 _MOST_PASSES = 10
 # Passes with a new median star: later ones change it by less than its noise.

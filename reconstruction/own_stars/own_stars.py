@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.random_streams import stream
-from ...core.statistics import column_median, finite_median, sorted_columns
+from ...core.statistics import finite_median, median_image
 from ...core.units import positive_angle, real_array, require_seed
 from ...measure.pixel_masks import fill_symmetric
-from ...measure.shapes import Shapes, fwhm, measure_shapes
-from ...measure.stamps import center_masks, center_stamps, decenter_masks
+from ...measure.shapes import fwhm, measure_shapes
+from ...measure.stamps import center_masks, decenter_masks, shift_to_middle
 from ...measure.star_selection import StarFlag, flag_stars, require_stars
 from ..psf_model import kriging
 from ..psf_model.checks import as_extent
@@ -68,7 +68,8 @@ def fit_own_stars(
 
     The model is kriging of pixels, which learns from the stars how smooth the PSF is, a constant included, or that of
     the options. A fifth of the stars at a time is predicted by the others; by kriging of pixels under the covariances
-    and the response of the pixels to the shape of all stars, by other models with a fit of its own.
+    and the response of the pixels to the shape of all stars, when the predictions are read, by other models with a fit
+    of its own.
 
     Parameters
     ----------
@@ -133,7 +134,7 @@ def fit_own_stars(
         return center_masks(bad[inner][chosen], filled.x[chosen], filled.y[chosen], size)
 
     def centre(filled: FilledStars, stars: Any = slice(None)) -> np.ndarray:
-        return center_stamps(filled.images[stars], filled.x[stars], filled.y[stars], size=size, normalize=False)
+        return shift_to_middle(filled.images[stars], np.stack([filled.x[stars], filled.y[stars]], axis=1), size)
 
     def select(filled: FilledStars, flags: np.ndarray, apart: np.ndarray, centred: np.ndarray) -> _CentredStars:
         flags = np.where(filled.usable, flags, flags | StarFlag.UNUSABLE)
@@ -163,10 +164,7 @@ def fit_own_stars(
     def colours_of(chosen: np.ndarray) -> np.ndarray | None:
         return None if colours is None else colours[chosen]
 
-    def predict(model: PsfModel) -> np.ndarray:
-        coefficients = model.interpolation.left_out(parts, model.coefficients)
-        if coefficients is not None:
-            return model.basis.at(coefficients)
+    def refit() -> np.ndarray:
         predicted = np.empty((len(used_indices), size, size))
         for held_out_indices in parts:
             fitted_indices = np.setdiff1d(np.arange(len(used_indices)), held_out_indices)
@@ -230,17 +228,9 @@ def fit_own_stars(
     )
     good = stars.images[used]
     used_masks = masks_of(stars.filled, used)
-    weightless = used_masks if used_masks.any() else None
     model = fit(used_indices)
-    predicted = predict(model)
-    psf = predicted.mean(axis=0)
-    stamps_used = good / good.sum(axis=(1, 2), keepdims=True)
-    deviations = (stamps_used - psf).reshape(len(used_indices), -1)
-    filters = kriging.shape_numbers(psf, deviations, weight_sigma(scale, weight) ** 2)[1]
-    # Shape numbers are twice the changes of e and of the logarithm of the size.
-    sigma = 0.5 * np.sqrt(kriging.star_noise(good, deviations, psf, filters, gain, weightless))
-    held_out = _spread(measure_shapes(predicted, scale, weight), used)
-    sigmas = np.sqrt((sigma[:, :2] ** 2).mean(axis=1)), sigma[:, 2]
+    flux = good.sum(axis=(1, 2))
+    kriging.require_electrons(flux * gain, gain)
     return OwnStars(
         model,
         places,
@@ -248,11 +238,11 @@ def fit_own_stars(
         stars.flags,
         used,
         shapes,
-        held_out,
-        stamps_used,
-        predicted,
+        good / flux[:, None, None],
         used_masks,
-        *sigmas,
+        flux * gain,
+        parts,
+        None if model.interpolation.predicts_left_out else refit(),
         scale,
         weight,
         "given" if model_options else DEFAULT_KIND,
@@ -280,7 +270,7 @@ class _CentredStars:
         with_defects = (self.flags != 0) & ((self.flags & ~_MASKABLE) == 0)
         if not len(good) or not with_defects.any():
             return np.zeros(len(self.flags), dtype=bool)
-        median_star = np.median(good / good.sum(axis=(1, 2), keepdims=True), axis=0)
+        median_star = median_image(good / good.sum(axis=(1, 2), keepdims=True))
         return with_defects & apart_from_core(defects, median_star, sigma)
 
     def usable_ones(self, usable: np.ndarray) -> _CentredStars:
@@ -308,20 +298,10 @@ def _flux_and_snr(stamps: np.ndarray, rms: np.ndarray, gain: float) -> tuple[np.
     bright = total > 0.0
     if not bright.any():
         return np.full(len(stamps), np.nan), np.full(len(stamps), np.nan)
-    psf = column_median(sorted_columns((stamps[bright] / total[bright, None, None]).reshape(bright.sum(), -1)))
+    psf = median_image(stamps[bright] / total[bright, None, None])
     psf /= psf.sum()
     squares = (psf**2).sum()
     # The sum over a wide stamp has ten times the noise of the fit.
-    flux = (stamps.reshape(len(stamps), -1) * psf).sum(axis=1) / squares
+    flux = (stamps * psf).sum(axis=(1, 2)) / squares
     flux = np.where(flux > 0.0, flux, np.nan)
     return flux, flux / np.sqrt(flux / gain + rms**2 / squares)
-
-
-def _spread(shapes: Shapes, used: np.ndarray) -> Shapes:
-    """Return shapes of some stars as those of all, NaN for the others."""
-    values = {}
-    for name, value in vars(shapes).items():
-        all_stars = np.full(len(used), -1 if value.dtype.kind in "iu" else np.nan, dtype=value.dtype)
-        all_stars[used] = value
-        values[name] = all_stars
-    return Shapes(**values)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,10 +19,12 @@ from ...core.units import ARCMIN, ARCSEC, require_count
 from ...measure.correlation import LARGEST_SEPARATION, LEAST_SEPARATION, MOST_BINS, SeparationBins
 from ...measure.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
 from ...measure.rho_statistics import RhoStatistics, rho_statistics
-from ...measure.shapes import Shapes, fwhm
+from ...measure.shapes import Shapes, fwhm, measure_shapes
 from ...measure.star_selection import StarFlag
+from ..psf_model.kriging import shape_numbers, star_noise
 from ..psf_model.model import PsfModel
 from ..stamp_gallery import StampGallery, stretched
+from .masked_stars import weight_sigma
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,14 +56,16 @@ class OwnStars(Result):
         [n] bool.
     shapes : Shapes
         Of the stars, angles in rad.
-    held_out : Shapes
-        Of the model made without the star and others of its part; NaN for stars that are not used.
-    stamps, predicted : ndarray
-        Used stars and the models made without them, unit sum, [n_used, ny, nx].
+    stamps : ndarray
+        Used stars of unit sum, [n_used, ny, nx].
     masks : ndarray
         Pixels of `stamps` without weight, which hold the model in place of the star, bool [n_used, ny, nx].
-    sigma_e, sigma_size : ndarray
-        Noise of a component of the ellipticity, and of the relative size, of the used stars, [n_used].
+    electrons : ndarray
+        Of the used stars, [n_used].
+    parts : list of ndarray
+        Indices of the used stars that are held out together.
+    refitted : ndarray or None
+        Predictions of the used stars by models that were fitted without them, [n_used, ny, nx], where that is needed.
     pixel_scale, weight_fwhm : float
         Of the stamps [rad], and of the weight of the moments [rad].
     kind : str
@@ -75,12 +80,11 @@ class OwnStars(Result):
     flags: np.ndarray
     used: NDArray[np.bool_]
     shapes: Shapes
-    held_out: Shapes
     stamps: np.ndarray
-    predicted: np.ndarray
     masks: NDArray[np.bool_]
-    sigma_e: np.ndarray
-    sigma_size: np.ndarray
+    electrons: np.ndarray
+    parts: list[np.ndarray]
+    refitted: np.ndarray | None
     pixel_scale: float
     weight_fwhm: float
     kind: str
@@ -103,6 +107,44 @@ class OwnStars(Result):
             "held_out_size": (model_shapes.size / ARCSEC, "arcsec", "size of the model made without the star"),
         }
         return described_table(columns, {})
+
+    @cached_property
+    def predicted(self) -> np.ndarray:
+        """Models made without the used star and others of its part, of unit sum, [n_used, ny, nx]."""
+        if self.refitted is not None:
+            return self.refitted
+        return self.model.basis.at(self.model.interpolation.left_out(self.parts, self.model.coefficients))
+
+    @cached_property
+    def held_out(self) -> Shapes:
+        """Shapes of the model made without the star and others of its part; NaN for stars that are not used."""
+        values = {}
+        for name, value in vars(measure_shapes(self.predicted, self.pixel_scale, self.weight_fwhm)).items():
+            all_stars = np.full(len(self.used), -1 if value.dtype.kind in "iu" else np.nan, dtype=value.dtype)
+            all_stars[self.used] = value
+            values[name] = all_stars
+        return Shapes(**values)
+
+    @property
+    def sigma_e(self) -> np.ndarray:
+        """Noise of a component of the ellipticity of the used stars, [n_used]."""
+        return np.sqrt((self._noise[:, :2] ** 2).mean(axis=1))
+
+    @property
+    def sigma_size(self) -> np.ndarray:
+        """Noise of the relative size of the used stars, [n_used]."""
+        return self._noise[:, 2]
+
+    @cached_property
+    def _noise(self) -> np.ndarray:
+        """Noise of e1, e2 and of the relative size, [n_used, 3]."""
+        psf = self.predicted.mean(axis=0)
+        deviations = (self.stamps - psf).reshape(len(self.stamps), -1)
+        filters = shape_numbers(psf, deviations, weight_sigma(self.pixel_scale, self.weight_fwhm) ** 2)[1]
+        images = self.stamps * self.electrons[:, None, None]
+        # Shape numbers are twice the changes of e and of the logarithm of the size.
+        masked = self.masks if self.masks.any() else None
+        return 0.5 * np.sqrt(star_noise(images, deviations, psf, filters, 1.0, masked))
 
     def residuals(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return e1, e2 and relative size of the used stars less those predicted without them, [n_used] each."""

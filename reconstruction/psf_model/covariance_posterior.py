@@ -15,8 +15,12 @@ from .covariance import LENGTH, PROCESS_COLUMNS, SmoothCovariance, columns_of_te
 
 # The search ends so far from the prior mean: stars without noise have variances of 10^6 in units of theirs.
 _REACH = 24.0
-# A search ends where the next step is expected to gain less, in the logarithm of the posterior.
-_LEAST_GAIN = 1e-5
+# A search ends where the next step is expected to gain less, in the logarithm of the posterior: a hundredth of the
+# standard deviations of the logarithms.
+_LEAST_GAIN = 1e-4
+# ... or where it is nearer than this to a better place of another search for the same form, in all logarithms: a
+# fraction of their standard deviations.
+_SAME_PLACE = 0.3
 # Steps gain less than so many times what they are expected to.
 _SURE = 5.0
 # Most steps of a search, and the longest one of a logarithm.
@@ -237,33 +241,38 @@ class Posterior:
         From starts by Newton's steps, with the expected second derivatives where the surface is no bowl (Fisher's
         scoring), and damped where a step gains nothing (Marquardt 1963); all forms at once, of the CCDs `ccd`
         [n_forms]. Columns that are not present stay as they were. The search for a form ends, too, where its value will
-        stay above `largest`.
+        stay above `largest`, or where one from another start has been.
         """
         low, high = self.middle - _REACH, self.middle + _REACH
         varied = present & ~(fixed_length & (np.arange(present.shape[1]) == LENGTH))
-        logarithms = np.where(varied, np.clip(starts, low, high), starts)
-        best = self.negative_log_posterior(logarithms, present, ccd)
-        damping, moving = np.zeros(len(starts)), np.arange(len(starts))
-        most = np.broadcast_to(largest, damping.shape)
+        at = np.where(varied, np.clip(starts, low, high), starts)
+        here, damping, searches = self.negative_log_posterior(at, present, ccd), np.zeros(len(at)), np.arange(len(at))
+        logarithms, values, most = at.copy(), here.value.copy(), np.broadcast_to(largest, len(at))
+        same_form = (present[:, None] == present).all(axis=2) & (ccd[:, None] == ccd) & ~np.eye(len(at), dtype=bool)
         for _ in range(_MOST_STEPS):
-            at, here = logarithms[moving], best.of_forms(moving)
-            free = varied[moving] & ~((at <= low) & (here.slope > 0.0)) & ~((at >= high) & (here.slope < 0.0))
-            step = here.step(free, damping[moving])
+            free = varied & ~((at <= low) & (here.slope > 0.0)) & ~((at >= high) & (here.slope < 0.0))
+            step = here.step(free, damping)
             gain = -0.5 * (here.slope * step).sum(axis=1)
-            going = (gain > _LEAST_GAIN) & (damping[moving] < _MOST_DAMPING)
-            going &= here.value - _SURE * gain < most[moving]
-            moving, at, step = moving[going], at[going], step[going]
-            if not len(moving):
+            going = (gain > _LEAST_GAIN) & (damping < _MOST_DAMPING) & (here.value - _SURE * gain < most)
+            if same_form.any():
+                beside = np.abs(at[:, None] - logarithms).max(axis=2) < _SAME_PLACE
+                going &= ~(beside & same_form & (values < here.value[:, None])).any(axis=1)
+            if not going.any():
                 break
+            if not going.all():
+                at, step, damping, searches = at[going], step[going], damping[going], searches[going]
+                here, varied, present, most = here.of_forms(going), varied[going], present[going], most[going]
+                same_form, ccd = same_form[going], ccd[going]
             step *= np.minimum(1.0, _LONGEST_STEP / np.abs(step).max(axis=1, keepdims=True))
-            at = np.where(varied[moving], np.clip(at + step, low, high), at)
-            there = self.negative_log_posterior(at, present[moving], ccd[moving])
-            better = there.value < best.value[moving]
-            logarithms[moving[better]] = at[better]
-            best.replace(moving[better], there.of_forms(better))
-            lower = np.where(damping[moving] > _DAMPING, damping[moving] / _DAMPING_FACTOR, 0.0)
-            damping[moving] = np.where(better, lower, np.maximum(_DAMPING_FACTOR * damping[moving], _DAMPING))
-        return logarithms, best.value
+            next_at = np.where(varied, np.clip(at + step, low, high), at)
+            there = self.negative_log_posterior(next_at, present, ccd)
+            better = there.value < here.value
+            at = np.where(better[:, None], next_at, at)
+            here.replace(better, there.of_forms(better))
+            lower = np.where(damping > _DAMPING, damping / _DAMPING_FACTOR, 0.0)
+            damping = np.where(better, lower, np.maximum(_DAMPING_FACTOR * damping, _DAMPING))
+            logarithms[searches], values[searches] = at, here.value
+        return logarithms, values
 
 
 def _inverses(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -183,12 +183,17 @@ class FittedInterpolation:
         """Return coefficients [n, k] of the stars less their prediction by the other stars; NaN where there is none."""
         raise NotImplementedError
 
-    def left_out(self, parts: list[np.ndarray], coefficients: np.ndarray) -> np.ndarray | None:
-        """Return predictions [n, k] of all stars, those of a part by all others; None where it takes another fit.
+    @property
+    def predicts_left_out(self) -> bool:
+        """Whether :meth:`left_out` needs no other fit."""
+        return False
+
+    def left_out(self, parts: list[np.ndarray], coefficients: np.ndarray) -> np.ndarray:
+        """Return predictions [n, k] of all stars, those of a part by all others, without another fit.
 
         `parts` are indices of the stars that are left out together, of all stars in all; `coefficients` [n, k] theirs.
         """
-        return None
+        raise NotImplementedError
 
     def truncated(self, count: int) -> Self:
         """Return the interpolation of the first components only."""

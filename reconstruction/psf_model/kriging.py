@@ -194,15 +194,19 @@ class FittedKriging(FittedInterpolation, kind=Kriging):
             shape_differences = differences(numbers) @ self.fields.response
             return shape_differences + residuals_left_out(residuals, self.fields, signal, noise)
 
-    def left_out(self, parts: list[np.ndarray], coefficients: np.ndarray) -> np.ndarray | None:
+    @property
+    def predicts_left_out(self) -> bool:
+        """Whether the components are pixels: principal ones hold the stars that are left out."""
+        return self.fields is not None and self.weights is not None
+
+    def left_out(self, parts: list[np.ndarray], coefficients: np.ndarray) -> np.ndarray:
         """Return predictions of all stars, each part of them by the others; arguments as those of the base class.
 
         Covariances, the response of the pixels to the shape, and the noise are those of all stars, as in
-        :meth:`leave_one_out`; the search for them is most of a fit's time. None where the components are not pixels:
-        principal ones hold the stars that are left out.
+        :meth:`leave_one_out`; the search for them is most of a fit's time.
         """
-        if self.fields is None or self.weights is None:
-            return None
+        assert self.fields is not None
+        assert self.weights is not None
         points = mapped(self.positions, self.extent)
         noise, terms = 1.0 / self.weights, self.terms()
         colour_count = 0 if self.colour is None else len(self.colour.slope)
@@ -295,15 +299,20 @@ def star_noise(
     noise = sky_variance[:, None] * sky_noise
     if gain is not None:
         electrons = images.sum(axis=(1, 2)) * gain
-        if np.median(electrons) < FEWEST_ELECTRONS:
-            raise DomainError(
-                f"gain = {gain:g}: the middle star has {np.median(electrons):.3g} electrons; expected stamps in "
-                "electrons, gain in electrons a unit, or gain = None for no photon noise"
-            )
+        require_electrons(electrons, gain)
         light = np.maximum(mean.ravel(), 0.0)
         photon_noise = (filters**2 @ light) * _correlation_factors(correlations, filters * np.sqrt(light), mean.shape)
         noise = noise + photon_noise / electrons[:, None]
     return noise
+
+
+def require_electrons(electrons: np.ndarray, gain: float) -> None:
+    """Raise DomainError for stars [n] of fewer electrons than photon noise is known of."""
+    if np.median(electrons) < FEWEST_ELECTRONS:
+        raise DomainError(
+            f"gain = {gain:g}: the middle star has {np.median(electrons):.3g} electrons; expected stamps in "
+            "electrons, gain in electrons a unit, or gain = None for no photon noise"
+        )
 
 
 def middle_star_noise(
