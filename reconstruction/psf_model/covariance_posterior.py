@@ -88,11 +88,29 @@ class SecondOrder:
     def step(self, free: np.ndarray, damping: np.ndarray) -> np.ndarray:
         """Return Newton's steps of the variables that are free, [n, k], with so much of the diagonal added [n]."""
         both, unit = free[:, :, None] & free[:, None], np.eye(free.shape[1])
-        curvature, expected = (np.where(both, matrix, unit) for matrix in (self.curvature, self.expected))
-        bowl = np.linalg.eigvalsh(curvature)[:, 0] > _LEAST_CURVATURE
-        matrices = np.where(bowl[:, None, None], curvature, expected)
-        matrices = matrices * (1.0 + damping[:, None, None] * unit)
+        matrices = np.where(both, self.curvature, unit)
+        bowl = np.linalg.eigvalsh(matrices)[:, 0] > _LEAST_CURVATURE
+        if not bowl.all():
+            matrices = np.where(bowl[:, None, None], matrices, np.where(both, self.expected, unit))
+        if damping.any():
+            matrices = matrices * (1.0 + damping[:, None, None] * unit)
         return np.asarray(-np.linalg.solve(matrices, np.where(free, self.slope, 0.0)[:, :, None])[:, :, 0])
+
+
+class _Changes(NamedTuple):
+    """Changes by the logarithms of the columns of kernels before those of the trend, [m, p]: three, or noise alone.
+
+    dC are the changes of the covariance C by them, y the values of the stars, t the terms of the trend.
+    """
+
+    solved: np.ndarray  #: C^-1 times values and terms, [m, n, 3 + n_terms]
+    log_determinant: np.ndarray  #: of C, [m]
+    slope: np.ndarray  #: of twice the value, [m, p]
+    expected: np.ndarray  #: tr(C^-1 dC C^-1 dC'), [m, p, p]
+    observed: np.ndarray  #: y' C^-1 dC C^-1 dC' C^-1 y, [m, p, p]
+    expected_with_terms: np.ndarray  #: t' C^-1 dC C^-1 t, [m, p, n_terms]
+    with_terms: np.ndarray  #: t' C^-1 dC C^-1 y, [m, p, n_terms, 3]
+    bend: np.ndarray  #: as the slope, by the part of the second change by the length that is not the first, [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,85 +153,112 @@ class Posterior:
         return SecondOrder(*(np.concatenate(each) for each in zip(*(vars(p).values() for p in parts), strict=True)))
 
     def _negative_log_posterior(self, logarithms: np.ndarray, present: np.ndarray, ccd: np.ndarray) -> SecondOrder:
-        kernels = self.kernels(logarithms, present)
-        numbers, terms, real = self.numbers[ccd], self.terms[ccd], self.real[ccd]
-        transposed_terms = terms.transpose(0, 2, 1)
-        count, common = numbers.shape[2], kernels[:, _NOISE]
-        trend = trend_variances(kernels, terms.shape[2], self.colour_count)
-        # What fills stars up has a variance of 1: it adds 1 each to traces, and nothing to logarithms.
-        variance = np.where(real, self.noise[ccd] + common[:, None], 1.0)
-        filling = (~real).sum(axis=1)
-        slope, (expected, observed) = np.zeros(kernels.shape), np.zeros((2, *kernels.shape, kernels.shape[1]))
+        kernels, values_and_terms = self.kernels(logarithms, present), self.values_and_terms[ccd]
+        trend = trend_variances(kernels, self.terms.shape[2], self.colour_count)
         # A change dC of the covariance changes the value by half the sum of count C^-1 - C^-1 y y' C^-1 times dC. The
         # second derivative by two of them has the expected part count/2 tr(C^-1 dC C^-1 dC'), and without what the
         # values are expected to be y' C^-1 dC C^-1 dC' C^-1 y less that.
-        if present[0, 0]:
-            ratio = self.distance[ccd] / kernels[:, LENGTH, None, None]
-            changes = np.empty((len(kernels), 2, *ratio.shape[1:]))  # by the variance and by the length
-            decay = np.multiply(kernels[:, 0, None, None], np.exp(-ratio), out=changes[:, 0])
-            np.multiply(decay, ratio, out=changes[:, 1])
-            covariance = decay + (terms * trend[:, None]) @ transposed_terms
-            _diagonals(covariance)[:] += variance
-            inverse, log_determinant = _inverses(covariance)
-            inverse_values = inverse @ self.values_and_terms[ccd]
-            precision, square = np.diagonal(inverse, axis1=1, axis2=2), np.einsum("mij,mij->m", inverse, inverse)
-            solved, inverse_terms = inverse_values[:, :, :count], inverse_values[:, :, count:]
-            again = inverse @ solved
-            surprise = count * inverse - solved @ solved.transpose(0, 2, 1)
-            relative = inverse[:, None] @ changes
-            changed = changes @ inverse_values[:, None]
-            back = inverse[:, None] @ changed[..., :count]
-            slope[:, :2] = np.einsum("mij,mpij->mp", surprise, changes)
-            bend = np.einsum("mij,mij->m", surprise * ratio, changes[:, 1]) - slope[:, LENGTH]
-            expected[:, :2, :2] = np.einsum("mpij,mqji->mpq", relative, relative)
-            expected[:, :2, _NOISE] = common[:, None] * np.einsum("mpij,mij->mp", relative, inverse)
-            of_terms = np.einsum("mna,mpna->mpa", inverse_terms, changed[..., count:])
-            expected[:, :2] += (trend[:, None] * of_terms) @ self.to_columns
-            observed[:, :2, :2] = np.einsum("mpnk,mqnk->mpq", changed[..., :count], back)
-            observed[:, :2, _NOISE] = common[:, None] * np.einsum("mnk,mpnk->mp", solved, back)
-            of_terms = np.einsum("mpak,mak->mpa", transposed_terms[:, None] @ back, transposed_terms @ solved)
-            observed[:, :2] += (trend[:, None] * of_terms) @ self.to_columns
-        else:
-            smooth = SmoothCovariance.of(terms, variance, trend)
-            inverse_values, log_determinant = smooth.solve(self.values_and_terms[ccd]), smooth.log_determinant
-            precision, square = smooth.precision, smooth.square
-            solved, inverse_terms = inverse_values[:, :, :count], inverse_values[:, :, count:]
-            again, bend = smooth.solve(solved), 0.0
-        away = np.where(present, (logarithms - self.middle) / self.width, 0.0)
-        value = 0.5 * (
-            np.einsum("mnk,mnk->m", solved, numbers) + count * log_determinant + np.einsum("mc,mc->m", away, away)
-        )
-        slope[:, _NOISE] = common * (
-            count * (precision.sum(axis=1) - filling) - np.einsum("mnk,mnk->m", solved, solved)
-        )
-        transposed = transposed_terms @ inverse_values
-        of_values, between = transposed[:, :, :count], transposed[:, :, count:]
+        changes = (self._changes_with_process if present[0, 0] else self._changes)(kernels, trend, ccd)
+        count, first = self.numbers.shape[2], PROCESS_COLUMNS - changes.slope.shape[1]
+        before_trend = slice(first, PROCESS_COLUMNS)
+        between = values_and_terms.transpose(0, 2, 1) @ changes.solved
+        of_values, of_terms = between[:, count:, :count], between[:, count:, count:]
         products = of_values @ of_values.transpose(0, 2, 1)
-        change = np.diagonal(count * between - products, axis1=1, axis2=2)
-        slope += (trend * change) @ self.to_columns
-        slope *= 0.5
-        expected[:, _NOISE, _NOISE] = common**2 * (square - filling)
-        observed[:, _NOISE, _NOISE] = common**2 * np.einsum("mnk,mnk->m", solved, again)
-        of_noise = common[:, None] * trend
-        of_terms = np.einsum("mna,mna->ma", inverse_terms, inverse_terms)
-        expected[:, _NOISE] += (of_noise * of_terms) @ self.to_columns
-        of_terms = np.einsum("mak,mak->ma", transposed_terms @ again, of_values)
-        observed[:, _NOISE] += (of_noise * of_terms) @ self.to_columns
-        trends = trend[:, :, None] * trend[:, None] * between
-        expected += self.to_columns.T @ (trends * between) @ self.to_columns
-        observed += self.to_columns.T @ (trends * products) @ self.to_columns
-        expected *= 0.5 * count
-        curvature = observed - expected
+        away, prior = logarithms - self.middle, present * self.width**-2.0
+        value = 0.5 * (
+            np.einsum("mkk->m", between[:, :count, :count])
+            + count * changes.log_determinant
+            + np.einsum("mc,mc,mc->m", away, away, prior)
+        )
+        of_trend = count * np.einsum("maa->ma", of_terms) - np.einsum("maa->ma", products)
+        slope = (0.5 * trend * of_trend) @ self.to_columns
+        slope[:, before_trend] = 0.5 * changes.slope
+        trends = trend[:, :, None] * trend[:, None] * of_terms
+        matrices = self.to_columns.T @ (trends * np.stack([of_terms, products])) @ self.to_columns
+        observed_with_trend = np.einsum("mpak,mak->mpa", changes.with_terms, of_values)
+        rows = (trend[:, None] * np.stack([changes.expected_with_terms, observed_with_trend])) @ self.to_columns
+        matrices[:, :, before_trend] += rows
+        matrices[:, :, :, before_trend] += rows.swapaxes(2, 3)
+        matrices[:, :, before_trend, before_trend] = np.stack([changes.expected, changes.observed])
+        expected = 0.5 * count * matrices[0]
+        curvature = matrices[1] - expected
         # Of logarithms the second derivative has the first one besides.
         _diagonals(curvature)[:] += slope
-        curvature[:, LENGTH, LENGTH] += 0.5 * bend - slope[:, LENGTH]
-        curvature[:, 0, LENGTH] += slope[:, LENGTH]
-        prior = np.where(present, self.width**-2.0, 0.0)
-        lower = np.tri(len(self.middle), k=-1, dtype=bool)
+        if first == 0:
+            curvature[:, LENGTH, LENGTH] += 0.5 * changes.bend - 2.0 * slope[:, LENGTH]
+            curvature[:, 0, LENGTH] += slope[:, LENGTH]
+            curvature[:, LENGTH, 0] += slope[:, LENGTH]
         for matrix in (expected, curvature):
             _diagonals(matrix)[:] += prior
-            np.copyto(matrix, matrix.transpose(0, 2, 1).copy(), where=lower)
-        return SecondOrder(value, slope + away / self.width, curvature, expected)
+        return SecondOrder(value, slope + away * prior, curvature, expected)
+
+    def _changes_with_process(self, kernels: np.ndarray, trend: np.ndarray, ccd: np.ndarray) -> _Changes:
+        """Return what changes by the first three columns of kernels with a process: its variance, length, and noise."""
+        terms, values_and_terms = self.terms[ccd], self.values_and_terms[ccd]
+        count, common = self.numbers.shape[2], kernels[:, _NOISE]
+        ratio = self.distance[ccd] / kernels[:, LENGTH, None, None]
+        # By the length for the second time, by the variance, by the length.
+        changes = np.empty((len(kernels), 3, *ratio.shape[1:]))
+        decay = np.multiply(kernels[:, 0, None, None], np.exp(-ratio), out=changes[:, 1])
+        np.multiply(decay, ratio, out=changes[:, 2])
+        np.multiply(changes[:, 2], ratio, out=changes[:, 0])
+        covariance = decay + (terms * trend[:, None]) @ terms.transpose(0, 2, 1)
+        _diagonals(covariance)[:] += self._variances(common, ccd)
+        inverse, log_determinant = _inverses(covariance)
+        solved = inverse @ values_and_terms
+        changed = np.empty((len(kernels), 4, *solved.shape[1:]))
+        np.matmul(changes, solved[:, None], out=changed[:, :3])
+        np.multiply(common[:, None, None], solved, out=changed[:, 3])
+        squares = np.einsum("mna,mpna->mpa", solved, changed)
+        traces = np.einsum("mij,mpij->mp", inverse, changes)
+        trace_of_noise = common * (np.einsum("mii->m", inverse) - self.filling[ccd])
+        slope = count * np.column_stack([traces, trace_of_noise]) - squares[:, :, :count].sum(axis=2)
+        relative = np.empty((len(kernels), 3, *ratio.shape[1:]))
+        np.matmul(inverse[:, None], changes[:, 1:], out=relative[:, :2])
+        np.multiply(common[:, None, None], inverse, out=relative[:, 2])
+        expected = np.einsum("mpij,mqji->mpq", relative, relative)
+        expected[:, 2, 2] -= common**2 * self.filling[ccd]
+        of_values = changed[:, 1:, :, :count]
+        return _Changes(
+            solved,
+            log_determinant,
+            slope[:, 1:],
+            expected,
+            np.einsum("mpnk,mqnk->mpq", of_values, inverse[:, None] @ of_values),
+            squares[:, 1:, count:],
+            solved[:, None, :, count:].swapaxes(2, 3) @ of_values,
+            slope[:, 0],
+        )
+
+    def _changes(self, kernels: np.ndarray, trend: np.ndarray, ccd: np.ndarray) -> _Changes:
+        """Return what changes by the noise that all stars have, of kernels without a process."""
+        count, common = self.numbers.shape[2], kernels[:, _NOISE, None, None]
+        smooth = SmoothCovariance.of(self.terms[ccd], self._variances(kernels[:, _NOISE], ccd), trend)
+        solved = smooth.solve(self.values_and_terms[ccd])
+        of_values, of_terms = solved[:, :, :count], solved[:, :, count:]
+        squares = np.einsum("mna,mna->ma", solved, solved)[:, None]
+        trace = smooth.precision.sum(axis=1) - self.filling[ccd]
+        square_trace = smooth.square - self.filling[ccd]
+        observed = np.einsum("mnk,mnk->m", of_values, smooth.solve(of_values))
+        return _Changes(
+            solved,
+            smooth.log_determinant,
+            common[:, :, 0] * (count * trace[:, None] - squares[:, :, :count].sum(axis=2)),
+            common**2 * square_trace[:, None, None],
+            common**2 * observed[:, None, None],
+            common * squares[:, :, count:],
+            common[..., None] * (of_terms.swapaxes(1, 2) @ of_values)[:, None],
+            np.zeros(len(kernels)),
+        )
+
+    def _variances(self, common: np.ndarray, ccd: np.ndarray) -> np.ndarray:
+        """Return the variances of the stars' noise, [m, n]; 1 of what fills them up, which adds 1 each to traces."""
+        return np.where(self.real[ccd], self.noise[ccd] + common[:, None], 1.0)
+
+    @cached_property
+    def filling(self) -> np.ndarray:
+        """How many places of each CCD are filled up, [n_ccd]."""
+        return (~self.real).sum(axis=1)
 
     @cached_property
     def values_and_terms(self) -> np.ndarray:
