@@ -126,15 +126,16 @@ class Contrasts:
         """Return values [n, k] less their prediction by the other stars, [n, k] (Dubrule 1983)."""
         return self.dual(values, scales) / self.precision(scales)
 
-    def scale_of(self, values: np.ndarray, relative: np.ndarray) -> float:
+    def scale_of(self, values: np.ndarray, relative: np.ndarray, unit: np.ndarray) -> float:
         """Return the factor of the variances `relative` [k], 1 at most, of values [n, k] that has the largest evidence.
 
-        The variance of the noise of each column is unknown. Zero where no factor has the evidence that counts.
+        Both are in units of variances [k]. The variance of the noise of each column is unknown. Zero where no factor
+        has the evidence that counts.
         """
         mean_variance = float(self.variances.mean()) if len(self.variances) else 0.0
         if not mean_variance > 0.0:
             return 0.0
-        squares = (self.axes.T @ values) ** 2
+        squares = (self.axes.T @ values) ** 2 / unit
         factors = np.concatenate([[0.0], _FACTORS])
         log_powers, log_variances = log_powers_and_variances(squares, self.variances / mean_variance, relative, factors)
         evidence = -0.5 * (log_variances + len(squares) * log_powers)
@@ -183,20 +184,27 @@ def fit_pixel_fields(
     fields = PixelFields(filters, response, star.ravel(), np.zeros(star.size))
     brightest = np.sort(np.argsort(noise, kind="stable")[:_MOST_STARS])
 
-    def variances_of(residuals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-        contrasts = Contrasts.of(covariance[np.ix_(brightest, brightest)], noise[brightest])
-        return relative * contrasts.scale_of(residuals[brightest] / np.sqrt(noise_floor), relative)
+    def contrasts_of(covariance: np.ndarray) -> Contrasts:
+        """Return the contrasts of the brightest stars."""
+        return Contrasts.of(covariance[np.ix_(brightest, brightest)], noise[brightest])
+
+    def variances_of(residuals: np.ndarray, contrasts: Contrasts) -> np.ndarray:
+        bright = residuals if len(brightest) == len(residuals) else residuals[brightest]
+        return relative * contrasts.scale_of(bright, relative, noise_floor)
 
     residuals = fields.split(deviations)[1]
     shapes = shapes[:, :_SHAPE_NUMBERS]
     shape_covariance = shapes @ shapes.T
-    variances = variances_of(residuals, shape_covariance)
+    contrasts = contrasts_of(shape_covariance)
+    variances = variances_of(residuals, contrasts)
     if variances.any():
-        weights_of_stars = Contrasts.of(shape_covariance, noise).dual(residuals, variances)
-        response[:_SHAPE_NUMBERS] += fields.shapeless(variances * (shapes.T @ weights_of_stars))
+        if len(brightest) < len(noise):
+            contrasts = Contrasts.of(shape_covariance, noise)
+        response[:_SHAPE_NUMBERS] += fields.shapeless(variances * (shapes.T @ contrasts.dual(residuals, variances)))
         fields = PixelFields(filters, response, star.ravel(), fields.variances)
         residuals = fields.split(deviations)[1]
-    return PixelFields(filters, fields.response, fields.profile, variances_of(residuals, signal.covariance))
+    variances = variances_of(residuals, contrasts_of(signal.covariance))
+    return PixelFields(filters, fields.response, fields.profile, variances)
 
 
 def shape_response(star: np.ndarray) -> np.ndarray:

@@ -39,13 +39,15 @@ class SpokePupil:
     fraction: np.ndarray  #: of the pupil's area within each ring, [n_ring]
     quadrature: np.ndarray  #: weights of the rings, of sum 1, [n_ring]
     unit: np.ndarray  #: directions of the spokes, [n_spoke, 2]
-    count: int  #: number of points that was wanted
 
     @classmethod
-    def fill(cls, diameter: float, obscuration: float, count: int) -> SpokePupil:
-        """Return approximately ``count`` points of an annulus of given diameter [m] and linear obscuration."""
+    def fill(cls, diameter: float, obscuration: float, count: int, rings: int | None = None) -> SpokePupil:
+        """Return approximately ``count`` points of an annulus of given diameter [m] and linear obscuration.
+
+        They stand on so many rings, by default as far apart as the spokes are.
+        """
         require_count(count, "n_pupil", 10)
-        n_ring = min(math.ceil(math.sqrt(count / _SPOKES_PER_RING)), MOST_RINGS)
+        n_ring = rings or min(math.ceil(math.sqrt(count / _SPOKES_PER_RING)), MOST_RINGS)
         n_spoke = 4 * max(1, round(count / (4 * n_ring)))
         legendre = np.polynomial.legendre.Legendre.basis(n_ring - 1)
         node = np.concatenate([[-1.0], np.sort(legendre.deriv().roots().real), [1.0]])
@@ -56,7 +58,6 @@ class SpokePupil:
             fraction=fraction,
             quadrature=1.0 / (n_ring * (n_ring - 1) * legendre(node) ** 2),
             unit=np.stack([np.cos(angle), np.sin(angle)], axis=-1),
-            count=count,
         )
 
     @property

@@ -151,10 +151,19 @@ class FieldOptics:
         return np.asarray(inside.reshape(len(edges), -1))
 
 
+def field_optics(telescope: Telescope, wavelengths: tuple[float, ...], pupil: SpokePupil) -> FieldOptics | None:
+    """Return the polynomials of a telescope through points on spokes; None where they are not good enough.
+
+    Those of the last few are stored.
+    """
+    return _field_optics(telescope, wavelengths, len(pupil.radius), pupil.n_spoke)
+
+
 @lru_cache(maxsize=4)
-def field_optics(telescope: Telescope, wavelengths: tuple[float, ...], n_pupil: int) -> FieldOptics | None:
-    """Return the polynomials of a telescope through about `n_pupil` points; None where they are not good enough."""
-    pupil = SpokePupil.fill(telescope.pupil_diameter, telescope.pupil_obscuration, n_pupil)
+def _field_optics(
+    telescope: Telescope, wavelengths: tuple[float, ...], n_ring: int, n_spoke: int
+) -> FieldOptics | None:
+    pupil = SpokePupil.fill(telescope.pupil_diameter, telescope.pupil_obscuration, n_ring * n_spoke, n_ring)
     aimed = entrance_points(telescope, field_direction(np.zeros(1), np.zeros(1)), wavelengths[0], pupil.points)
     if aimed.ndim != 2:
         return None

@@ -150,8 +150,9 @@ class LatticeTransfer:
         if not lit.size:
             return out
         star_optics = replace(star_optics, pupil=star_optics.pupil[lit])
-        terms = self._terms(star_optics.pupil, _DEGREE if len(self.wavelengths) > 1 else 0)
-        path = star_optics.path[:, :, lit] + np.einsum("wt,pt->wp", rays.path[star], terms)
+        path = star_optics.path[:, :, lit]
+        if len(self.wavelengths) > 1:
+            path = path + np.einsum("wt,pt->wp", rays.path[star], self._terms(star_optics.pupil, _DEGREE))
         path = channels.path(replace(star_optics, path=path))[0]
         mean = star_optics.displacement[0, 0, lit].mean(axis=0, dtype=np.float64) + rays.shift[star][channels.wave]
         if channels.shift.any():

@@ -33,6 +33,7 @@ from ..atmosphere.exposure_fields import NOLL, ExposureFields, draw_exposure
 from ..atmosphere.moment_covariance import LEAST_EXPOSURE, ExposedAir, MomentResponse
 from ..atmosphere.turbulence import diffraction_otf
 from ..pupil_optics import PupilOptics, trace_pupils
+from .clear_pupil import SpokePupil
 from .engine import ExposedStars, PsfInputs, Stars
 from .far_from_focus import blur_radii, check_stamp
 from .field_optics import FieldOptics, field_optics
@@ -164,36 +165,35 @@ class StatisticalRenderer(LongExposureRenderer):
         )
         return spectrum
 
-    def _near_optics(self, stars: Stars) -> tuple[PupilOptics, np.ndarray]:
-        optics = self._field_optics
+    def _near_optics(self, stars: Stars, pupil: SpokePupil) -> tuple[PupilOptics, np.ndarray]:
+        optics = self._field_optics(pupil)
         if optics is None:
-            return super()._near_optics(stars)
+            return super()._near_optics(stars, pupil)
         direction = self._direction(stars.fields)
         slopes = direction[:, :2] / -direction[:, 2:]
         covered = optics.covers(slopes)
         if not covered.all():
-            return self._partly_covered(stars, covered)
+            return self._partly_covered(stars, covered, pupil)
         inputs = self._inputs
         interpolated, edges = optics.at(stars.fields, slopes, inputs.focal_plane, inputs.aberration, self._threads)
         check_stamp(interpolated, inputs.plane)
         return interpolated, edges
 
-    def _partly_covered(self, stars: Stars, covered: np.ndarray) -> tuple[PupilOptics, np.ndarray]:
+    def _partly_covered(self, stars: Stars, covered: np.ndarray, pupil: SpokePupil) -> tuple[PupilOptics, np.ndarray]:
         """Return optics and edges of stars of which some lie beyond the polynomials, and are traced."""
         groups = [np.flatnonzero(covered), np.flatnonzero(~covered)]
-        parts = [self._near_optics(stars[groups[0]])] if covered.any() else []
-        parts.append(super()._near_optics(stars[groups[1]]))
+        parts = [self._near_optics(stars[groups[0]], pupil)] if covered.any() else []
+        parts.append(super()._near_optics(stars[groups[1]], pupil))
         order = np.argsort(np.concatenate(groups))
         optics = PupilOptics.together([part for part, _ in parts])
         return optics.stars(order), np.concatenate([edges for _, edges in parts])[order]
 
-    @cached_property
-    def _field_optics(self) -> FieldOptics | None:
+    def _field_optics(self, pupil: SpokePupil) -> FieldOptics | None:
         """Optics interpolated over the field; None where rays are not those of the telescope, or not smooth."""
         inputs = self._inputs
         if inputs.trace is not trace_pupils:
             return None
-        return field_optics(inputs.telescope, tuple(self._wavelengths.tolist()), self._pupil.count)
+        return field_optics(inputs.telescope, tuple(self._wavelengths.tolist()), pupil)
 
     def _ray_counts(self, optics: PupilOptics) -> np.ndarray:
         return far_from_focus(optics, self.focal_length)

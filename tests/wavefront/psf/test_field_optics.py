@@ -7,12 +7,8 @@ import pachon
 from pachon.raytrace.rays import field_direction
 from pachon.wavefront.psf import field_optics as field_optics_module
 from pachon.wavefront.psf import statistical
-from pachon.wavefront.psf.clear_pupil import clear_edges
-from pachon.wavefront.psf.engine import Stars
-from pachon.wavefront.psf.engines import psf_engine
+from pachon.wavefront.psf.clear_pupil import SpokePupil, clear_edges
 from pachon.wavefront.psf.field_optics import LANDING_ERROR, field_optics
-from pachon.wavefront.psf.psf import psf_inputs
-from pachon.wavefront.psf.stamps import Stamps
 from pachon.wavefront.pupil_optics import trace_pupils
 
 WAVES = (545e-9, 703e-9)
@@ -31,10 +27,14 @@ def plane():
     return pachon.FocalPlane.from_budget("lsst", seed=1)
 
 
+def spokes(telescope):
+    return SpokePupil.fill(telescope.pupil_diameter, telescope.pupil_obscuration, 80)
+
+
 def test_optics_are_those_of_rays(lsst, plane):
     aberration = pachon.wavefront.ResidualWavefront.draw(lsst, 0.1e-6, 1, 0)
     fields = pachon.fields_at(lsst, plane.camera.centers[::23], WAVES[1])
-    optics = field_optics(lsst, WAVES, 80)
+    optics = field_optics(lsst, WAVES, spokes(lsst))
     for focal_plane, stars in ((plane, fields), (None, FIELDS)):
         interpolated, edges = optics.at(stars, np.tan(stars), focal_plane, aberration, 1)
         traced = trace_pupils(lsst, stars, WAVES, optics.pupil, focal_plane=focal_plane, aberration=aberration)
@@ -52,7 +52,7 @@ def test_optics_are_those_of_rays(lsst, plane):
 
 
 def test_a_star_depends_on_no_other(lsst, plane):
-    optics = field_optics(lsst, WAVES, 80)
+    optics = field_optics(lsst, WAVES, spokes(lsst))
     together, edges = optics.at(FIELDS, SLOPES, None, None, 2)
     for star in range(len(FIELDS)):
         alone, of_one = optics.at(FIELDS[star : star + 1], SLOPES[star : star + 1], None, None, 1)
@@ -63,12 +63,12 @@ def test_a_star_depends_on_no_other(lsst, plane):
 def test_a_star_between_ccds_is_an_error(lsst, plane):
     gap = pachon.fields_at(lsst, plane.camera.centers[:1] + np.array([0.0209, 0.0]))
     with pytest.raises(pachon.errors.DomainError, match="lands between the CCDs"):
-        field_optics(lsst, WAVES, 80).at(gap, np.tan(gap), plane, None)
+        field_optics(lsst, WAVES, spokes(lsst)).at(gap, np.tan(gap), plane, None)
 
 
 def test_what_is_not_smooth_is_traced(lsst, monkeypatch):
     monkeypatch.setattr(field_optics_module, "LANDING_ERROR", 1e-15)
-    assert field_optics.__wrapped__(lsst, WAVES, 80) is None
+    assert field_optics_module._field_optics.__wrapped__(lsst, WAVES, 5, 16) is None
 
 
 @pytest.mark.long
@@ -81,14 +81,11 @@ def test_shapes_are_those_of_traced_stars(lsst, monkeypatch):
     interpolated = shapes()
     # Some stars beyond the polynomials, and none within.
     monkeypatch.setattr(field_optics_module, "_REACHES", (0.6,))
-    small = field_optics.__wrapped__(lsst, WAVES, 80)
+    small = field_optics_module._field_optics.__wrapped__(lsst, WAVES, 5, 16)
     monkeypatch.setattr(statistical, "field_optics", lambda *_: small)
     partly = shapes()
     monkeypatch.setattr(statistical, "field_optics", lambda *_: None)
     traced = shapes()
-    inputs, _ = psf_inputs(lsst, FIELDS, WAVES, None, air, None, Stamps(), 1)
-    renderer = psf_engine("statistical").renderer(inputs)
-    assert renderer._near_optics(Stars(FIELDS[:1], np.zeros((1, 2))))[0].path.shape == (1, 2, 80)
     for moments in (interpolated, partly):
         for name in ("e1", "e2", "g1", "g2"):
             np.testing.assert_allclose(getattr(moments, name), getattr(traced, name), atol=1e-6)
