@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +52,10 @@ class FocalBench:
         low, high = self.places.min(axis=0), self.places.max(axis=0)
         self.center, self.reach = 0.5 * (low + high), 0.5 * float((high - low).max()) + half / side
 
+        names = [mosaic.names[i] for i in self.ccd]
+        #: Shapes at the places, and their standard deviations.
+        self.predicted: tuple[PsfShapes, PsfShapes] = model.predict(names, *self.places.T)
+
     @classmethod
     def read(cls, path: Path) -> FocalBench:
         """Read a model; ProductError where it is none."""
@@ -64,12 +67,6 @@ class FocalBench:
     def ccd_name(self, place: int) -> str:
         """Return the name of the CCD of a place."""
         return self.model.mosaic.names[self.ccd[place]]
-
-    @cached_property
-    def predicted(self) -> tuple[PsfShapes, PsfShapes]:
-        """Shapes at the places, and their standard deviations."""
-        names = self.model.mosaic.names
-        return self.model.predict([names[i] for i in self.ccd], *self.places.T)
 
     def whiskers(self) -> WhiskersView:
         """Return the predicted shapes, weighted moments, at all places."""
