@@ -158,7 +158,8 @@ def shift_to_middle(images: np.ndarray, offsets: np.ndarray, size: int) -> np.nd
     placed = np.flatnonzero(np.isfinite(offsets).all(axis=1))
     for first in range(0, len(placed), _SHIFTED_TOGETHER):
         indices = placed[first : first + _SHIFTED_TOGETHER]
-        stamps[indices] = fourier_shifts(images[indices], *(middle - offsets[indices]).T, rows, columns)
+        dx, dy = (middle - offsets[indices]).T
+        stamps[indices] = fourier_shifts(images[indices], dx, dy, rows, columns)
     return stamps
 
 

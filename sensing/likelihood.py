@@ -8,7 +8,7 @@ constant, :math:`\sum (d + s) \ln(m + s) - (m + s)` with data d, model m and sky
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -121,10 +121,7 @@ class Linearized:
 
 @dataclass(frozen=True)
 class _Derivatives:
-    """Image at unknowns of a star, its derivatives and their scales, where its light lands, and chi-square a pixel.
-
-    `latest` is the image at the last unknowns that these derivatives were used for, after its unknowns and light.
-    """
+    """Image at unknowns of a star, its derivatives and their scales, where its light lands, and chi-square a pixel."""
 
     rays: LightRays
     unknowns: np.ndarray
@@ -132,7 +129,6 @@ class _Derivatives:
     weights: np.ndarray
     image: tuple[np.ndarray, np.ndarray, np.ndarray]
     misfit: float
-    latest: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def holds(self, stamp: Stamp, unknowns: np.ndarray, landing: np.ndarray, weights: np.ndarray) -> bool:
         """Return whether the derivatives are those of light that lands elsewhere, too, but for a few per cent."""
@@ -159,17 +155,8 @@ def _derivatives(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> tuple[
         return None
     weights = stamp.rays.weights(wave)
     if isinstance(last, _Derivatives) and last.holds(stamp, unknowns, landing, weights):
-        # Errors, rims and diffraction follow a solution: all begin from its image.
-        point, latest = (unknowns, landing, weights), last.latest
-        if latest is None or not all(map(np.array_equal, latest, point)):
-            latest = (
-                unknowns.copy(),
-                landing,
-                weights,
-                stamp.grid.image(unknowns, _landed(stamp, wave, landing, None)),
-            )
-            stamp.grid.last = replace(last, latest=latest)
-        return latest[-1], last.image[1], stamp.grid.scales(unknowns, len(last.image[2]))
+        image = stamp.grid.image(unknowns, _landed(stamp, wave, landing, None))
+        return image, last.image[1], stamp.grid.scales(unknowns, len(last.image[2]))
     response = stamp.rays.response(wave)
     light = _landed(stamp, wave, landing, response)
     derivatives = stamp.grid.derivatives(unknowns, light, response, stamp.rays.rates)

@@ -54,20 +54,6 @@ def test_a_stationary_field_is_its_covariance():
     np.testing.assert_allclose(even.times(np.eye(20, dtype=np.float32)), expected, atol=1e-6)
 
 
-def test_an_image_is_made_once_for_a_point(behind_focus):
-    """What follows a solution begins from its image; any other point has its own."""
-    stamp = stamp_of(behind_focus, 48)
-    stamp = replace(stamp, image=model_image(stamp, STAR, WAVE))
-    linearized(stamp, STAR, WAVE)
-    solution = np.add(STAR, [1e4, 0.005, 0.0, 1.0, 0.0, 0.0, 0.0])
-    before = linearized(stamp, solution, WAVE)
-    assert linearized(stamp, solution, WAVE).model is before.model
-    for star, wave in ((np.add(solution, [0.0, 0.0, 1e-3, 0.0, 0.0, 0.0, 0.0]), WAVE), (solution, WAVE + 1e-11)):
-        point = linearized(stamp, star, wave)
-        assert np.abs(point.model - before.model).max() > 1e-6
-        np.testing.assert_allclose(point.model, model_image(stamp, star, wave), rtol=1e-12)
-
-
 def test_derivatives_hold_while_the_light_stays(behind_focus):
     """A hundredth of a pixel on they are those of before, at most a few per cent off; the image itself is exact."""
     stamp = stamp_of(behind_focus, 48)
