@@ -158,10 +158,10 @@ def improved(scene: Scene, names: list[str]) -> Improvement:
     start, slopes = spots.derivatives()
     before = float(np.linalg.norm(start))
     controls = {control.key: control for control in bench.controls}
-    chosen = [controls[f"optics.{name}"] for name in names]
-    now = np.array([state.value(control.key) for control in chosen])
-    low = np.minimum([control.low for control in chosen] - now, 0.0)
-    high = np.maximum([control.high for control in chosen] - now, 0.0)
+    sliders = [controls[f"optics.{name}"] for name in names]
+    start_values = np.array([state.value(control.key) for control in sliders])
+    low = np.minimum([control.low for control in sliders] - start_values, 0.0)
+    high = np.maximum([control.high for control in sliders] - start_values, 0.0)
 
     @lru_cache(maxsize=2)
     def at(*values: float) -> tuple[np.ndarray, np.ndarray]:
@@ -177,11 +177,11 @@ def improved(scene: Scene, names: list[str]) -> Improvement:
         np.zeros(len(names)),
         jac=lambda values: at(*values)[1] / before,
         bounds=(low, high),
-        x_scale=[control.high for control in chosen],
+        x_scale=[control.high for control in sliders],
         max_nfev=_EVALUATIONS,
     )
     after = before * float(np.linalg.norm(solution.fun))
     if after < before:
-        for control, value, change in zip(chosen, now, solution.x, strict=True):
+        for control, value, change in zip(sliders, start_values, solution.x, strict=True):
             state = state.with_value(control.key, float(value + change))
     return Improvement(state, 1e6 * before, 1e6 * min(before, after))

@@ -4,6 +4,7 @@ import http.client
 import re
 import select
 import shutil
+import signal
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -34,17 +35,30 @@ PATIENCE = 120_000
 TEXT = "() => window.Bokeh?.documents[0]?.get_model_by_name('numbers')?.text ?? ''"
 
 
+@contextmanager
+def served(source, port):
+    """Serve a desk: its address, and a list that gets exit status and further output when Ctrl-C has ended it."""
+    ending = []
+    command = [sys.executable, "-m", "pachon", "desk", str(source), "--no-browser", "--port", str(port)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
+        try:
+            assert select.select([server.stdout], [], [], 120.0)[0]
+            yield re.search(r"http://127\.0\.0\.1:\d+/[-\w]{32}", server.stdout.readline())[0], ending
+        finally:
+            server.send_signal(signal.SIGINT)
+            try:
+                rest, errors = server.communicate(timeout=60)
+                ending += [server.returncode, rest, errors]
+            finally:
+                server.kill()
+
+
 @pytest.fixture(scope="module")
 def address():
-    command = [sys.executable, "-m", "pachon", "desk", "lsst_v3.3_r", "--no-browser", "--port", "5306"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server:
-        assert select.select([server.stdout], [], [], 120.0)[0]
-        line = server.stdout.readline()
-        yield re.search(r"http://127\.0\.0\.1:\d+/[-\w]{32}", line)[0]
-        server.send_signal(2)
-        rest = server.communicate(timeout=60)[0]
+    with served("lsst_v3.3_r", 5306) as (url, ending):
+        yield url
     # Ctrl-C ends it, without a word.
-    assert (server.returncode, rest) == (0, "")
+    assert ending == [0, "", ""]
 
 
 @pytest.fixture(scope="module")
@@ -167,12 +181,9 @@ def test_other_addresses_and_other_origins_are_refused(address):
 
 def test_a_port_that_is_taken_gives_way_to_the_next(address):
     port = urlsplit(address).port
-    command = [sys.executable, "-m", "pachon", "desk", "lsst_v3.3_r", "--no-browser", "--port", str(port)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
-        assert select.select([server.stdout], [], [], 120.0)[0]
-        assert f":{port + 1}/" in server.stdout.readline()
-        server.send_signal(2)
-        assert server.communicate(timeout=60)[1] == f"port {port} is taken; the next free one is used\n"
+    with served("lsst_v3.3_r", port) as (url, ending):
+        assert urlsplit(url).port == port + 1
+    assert ending == [0, "", f"port {port} is taken; the next free one is used\n"]
 
 
 def test_an_exported_page_needs_nothing_else(browser, tmp_path):
@@ -196,13 +207,7 @@ def test_an_exported_page_needs_nothing_else(browser, tmp_path):
 
 
 def test_the_desk_of_a_run_draws_its_stars_and_a_clicked_ccd(finished_run, browser):
-    command = [sys.executable, "-m", "pachon", "desk", str(finished_run), "--no-browser", "--port", "5386"]
-    with (
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server,
-        ended(server),
-    ):
-        assert select.select([server.stdout], [], [], 120.0)[0]
-        url = re.search(r"http\S+", server.stdout.readline())[0]
+    with served(finished_run, 5386) as (url, _):
         page, problems, hosts = browser.new_page(), [], set()
         page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
         page.on("request", lambda request: hosts.add(urlsplit(request.url).hostname))
@@ -248,25 +253,9 @@ def test_pages_of_results_draw_without_errors(browser, tmp_path):
     page.close()
 
 
-@contextmanager
-def ended(server):
-    """End a server at the end of a test, one that fails too."""
-    try:
-        yield
-    finally:
-        server.send_signal(2)
-        server.communicate(timeout=60)
-
-
 def test_a_box_in_one_plot_of_a_sweep_selects_in_all_and_a_point_opens(browser, tmp_path):
     path = store_of(tmp_path)
-    command = [sys.executable, "-m", "pachon", "desk", str(path), "--no-browser", "--port", "5446"]
-    with (
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server,
-        ended(server),
-    ):
-        assert select.select([server.stdout], [], [], 120.0)[0]
-        url = re.search(r"http\S+", server.stdout.readline())[0]
+    with served(path, 5446) as (url, _):
         context = browser.new_context(viewport={"width": 1300, "height": 900})
         page, problems, hosts = context.new_page(), [], set()
         context.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
