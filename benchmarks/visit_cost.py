@@ -38,7 +38,7 @@ STAGES = [
     (FastRenderer, "_combine", "PSFs: filters"),
     (FastRenderer, "_stamps", "PSFs: stamps"),
     (psf_visit, "observe_ccd", "noise and centring of stars"),
-    (PsfModel, "fit", "models: fit"),
+    (psf_visit, "fit_ccd_models", "models: fit"),
     (PsfModel, "at", "models: PSFs at places"),
     (psf_visit, "resample_stamps", "resampling onto the stack"),
 ]

@@ -63,10 +63,7 @@ _LARGEST_LEFT = 1e-3
 # Part of the ring that is lit from which on rims cross few spokes. At 8 um of defocus e of the LSST is wrong by 1e-4 at
 # 0.8, by 5e-4 at 0.62, by 1.5e-3 at 0.57 and by 3e-3 at 0.42.
 _LEAST_LIT = 0.6
-# The same of many spokes, whose error falls with their number: down to here 128 are as good as the lattice, 4e-4 in e
-# and in size of the worst star.
-_LEAST_LIT_OF_DENSE = 0.5
-# Points on them, and rings.
+# Points on many spokes, and rings.
 _DENSE_POINTS = 768
 _DENSE_RINGS = 6
 # Kinds of stars beside those of so many rays: near focus.
@@ -129,6 +126,9 @@ class LongExposureRenderer(PsfRenderer):
     #: Largest transfer function of atmosphere and detector at a frequency that is left out; with pixels of 10 um all
     #: make 2e-6 of the peak of the image.
     negligible: ClassVar[float] = 1e-5
+    #: Part of the ring that is lit from which on many spokes stand for the lattice: size is then wrong by up to 3e-4,
+    #: since strips overlap where rims meet.
+    least_lit_of_dense: ClassVar[float] = _LEAST_LIT
 
     def __init__(self, inputs: PsfInputs, options: LongExposureEngine) -> None:
         super().__init__(inputs)
@@ -238,7 +238,7 @@ class LongExposureRenderer(PsfRenderer):
             return self._expose_lattice(stars)
         optics, edges = self._near_optics(stars, self._pupil)
         lit = self._lit_fraction(edges)
-        kinds = np.where(lit < _LEAST_LIT, np.where(lit < _LEAST_LIT_OF_DENSE, _VIGNETTED, _DENSE), _NEAR)
+        kinds = np.where(lit < _LEAST_LIT, np.where(lit < self.least_lit_of_dense, _VIGNETTED, _DENSE), _NEAR)
         if self._options.n_pupil is None:
             rays = self._ray_counts(optics)
             kinds = np.where(rays > 0, rays, kinds)

@@ -16,7 +16,7 @@ from pachon.wavefront.atmosphere.turbulence import diffraction_otf, structure_fu
 from pachon.wavefront.psf.engine import PsfInputs, Stars
 from pachon.wavefront.psf.image_plane import ImagePlane
 from pachon.wavefront.psf.lattice_pupil import FEWEST_POINTS, LatticeTransfer
-from pachon.wavefront.psf.long_exposure import LongExposureEngine, default_points
+from pachon.wavefront.psf.long_exposure import LongExposureEngine, LongExposureRenderer, default_points
 from pachon.wavefront.psf.mean_rays import MeanRaysRenderer
 from pachon.wavefront.psf.psf import make_psfs
 from pachon.wavefront.psf.stamps import Stamps
@@ -107,6 +107,23 @@ def test_against_brute_force_over_the_pupil(make, field_deg, plane, wavelengths,
     np.testing.assert_allclose(e, e_wave, atol=2e-4)
     assert size == pytest.approx(size_wave, rel=2e-4)
     np.testing.assert_allclose(stars.image[0], expected, atol=1.5e-3 * expected.max())
+
+
+@pytest.mark.long
+def test_many_spokes_of_a_half_lit_pupil(monkeypatch):
+    monkeypatch.setattr(LongExposureRenderer, "least_lit_of_dense", 0.5)
+    for telescope, field_deg in (
+        (defocused("lsst_v3.3_r", 10e-6), (1.5, 1.21)),
+        (tube(defocused("lsst_v3.3_r", 0.0)), (0.6, 0.85)),
+    ):
+        field = np.radians(field_deg)
+        expected, scale = brute_force(telescope, field, 620e-9, LSST, spacing=0.0125, longest=1.0)
+        stars = renderer_for(telescope, 620e-9, LSST).render(field[None], np.zeros((1, 2)))
+        assert 0.5 < stars.lit_fraction[0, 0] < 0.6
+        (e, size), (e_wave, size_wave) = shape(stars.image[0], scale), shape(expected, scale)
+        np.testing.assert_allclose(e, e_wave, atol=1e-4)
+        # Strips overlap where two rims meet.
+        assert size == pytest.approx(size_wave, rel=3.5e-4)
 
 
 def closed_form(plane, diameter, obscuration, focal, wavelength, r0, margin=1.25):
