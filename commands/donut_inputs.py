@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.errors import ConfigError, ProductError
+from .completion import YAML
 from .options import degrees_pair
 
 if TYPE_CHECKING:
@@ -95,6 +96,10 @@ class StampFiles:
         """Read files; ConfigError where a plane of its own goes with several of them."""
         from ..sensing.stamp_files import read_stamps
 
+        for path in paths:
+            if path.suffix.lower() in YAML:
+                text = "expected FITS files of stamps; a telescope is --telescope, and its camera stands in its file"
+                raise ConfigError(text, file=path)
         for option, plane in (("--mask", mask), ("--variance", variance)):
             if plane is not None and len(paths) > 1:
                 raise ConfigError(f"{option} = {plane} for {len(paths)} files: expected one file of stamps with it")

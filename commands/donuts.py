@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 from typer import Argument, Option
 
-from ..core.errors import ConfigError
+from ..core.errors import ConfigError, PrescriptionWarning
 from ..core.terminal import print_line, print_warning
 from . import completion
 from .choices import choice, names
@@ -24,7 +24,7 @@ from .donut_inputs import (
 )
 from .donut_report import observatory_summary, orientation_text, show_fit
 from .donut_simulation import simulate_file
-from .inputs import load_model
+from .inputs import load_model, warnings_shown
 from .interrupt import interruptible
 from .options import GlassCatalogues, Json, Lenient, Projection, Quiet, Threads, picture_kind, wavelength_list
 from .tables import print_json
@@ -357,6 +357,7 @@ def donuts_command(
         print_line(f"{files[0]}: {header.text} of its header; {believed.name}", error=True)
     orientation = None
     with (
+        warnings_shown(PrescriptionWarning),
         interruptible(quiet) as reporter,
         reporter.stage(f"wavefronts of {len(inputs.images)} donuts", total=len(inputs.images)) as stage,
     ):

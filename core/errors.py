@@ -115,7 +115,7 @@ class PrescriptionError(PachonError, ValueError):
 
 
 class PrescriptionWarning(UserWarning):
-    """Part of a lens file that is not understood and left out."""
+    """Part of a prescription that is not understood and left out, or that data contradict."""
 
 
 class PrescriptionNote(PrescriptionWarning):

@@ -20,12 +20,12 @@ from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, ProductError, error_context
 from ..core.files import content_hash
 from ..core.schema import Count, Positive, Real, Section, Switch, plain_number, validated
-from ..core.yaml_reader import read_mapping
 from ..pipeline.config import (
     Configuration,
     InterpolationName,
     PointingConfig,
     digest,
+    read_configuration,
     refuse_retired_interpolation,
     section_yaml,
     with_options,
@@ -172,7 +172,7 @@ def load_images_configuration(path: Path) -> ImagesConfig:
     ConfigError
         If a file cannot be read, is not YAML, or has an unknown key or a value out of range.
     """
-    config = validated(ImagesConfig, with_run(read_mapping(path, ConfigError), path), str(path))
+    config = validated(ImagesConfig, with_run(read_configuration(path), path), str(path))
     with error_context(file=path):
         return with_files(config, path.parent)
 

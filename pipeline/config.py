@@ -33,6 +33,7 @@ from ..core.schema import (
 )
 from ..core.yaml_reader import read_mapping
 from ..models.camera.photometry import BandName
+from ..models.io.camera_file import is_camera
 from ..reconstruction.psf_model.recipe import INTERPOLATIONS, BasisName, InterpolationName, Recipe, RecipeName, names_of
 from ..reconstruction.psf_model.retired_process import GaussianProcess
 from ..wavefront.psf.engines import EngineName
@@ -409,10 +410,17 @@ def load_configuration(path: Path) -> Configuration:
     ConfigError
         If the file cannot be read, is not YAML, or has an unknown key or a value out of range.
     """
+    return configuration_of(read_configuration(path), str(path))
+
+
+def read_configuration(path: Path) -> dict[str, Any]:
+    """Return the content of a configuration file; ConfigError of one line for a prescription or a camera file."""
     content = read_mapping(path, ConfigError)
     if {"surfaces", "opticalSystem"}.intersection(content):
         raise ConfigError(f"a prescription; expected a configuration, with the line telescope: {path.name}", file=path)
-    return configuration_of(content, str(path))
+    if is_camera(content):
+        raise ConfigError(f"a camera file; expected a configuration, a run's with camera: {path.name}", file=path)
+    return content
 
 
 def with_run(content: dict[str, Any], path: Path) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from .bad_pixels import grown
 from .fit_star import StarFit, fit_star
 from .flags import DonutFlag
 from .freedom_fit import TelescopeFreedoms
+from .hole import warn_of_other_hole
 from .image_model import (
     BACKGROUND,
     FLUX,
@@ -205,7 +206,9 @@ def fit_donuts(
         if terms is not None:
             instrument = Instrument.of(telescope, model, terms)
             fitted = fitted_stars(instrument, {}, None)
-    return _result(instrument, observed, fitted)
+    result = _result(instrument, observed, fitted)
+    warn_of_other_hole(instrument, fitted.solutions, result)
+    return result
 
 
 class _Fitted(NamedTuple):

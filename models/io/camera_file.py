@@ -151,8 +151,15 @@ class CameraFile(Section):
 
 
 def is_camera_file(path: Path) -> bool:
-    """Return whether a YAML file has the pixels of a camera; PrescriptionError where it cannot be read."""
-    return "pixel_um" in read_mapping(path)
+    """Return whether a YAML file is of a camera, whole or not; PrescriptionError where it cannot be read."""
+    return is_camera(read_mapping(path))
+
+
+def is_camera(content: dict[str, Any]) -> bool:
+    """Return whether the content of a file has pixels or CCDs of a camera; configurations name CCDs by texts."""
+    ccds = content.get("ccds")
+    has_ccds = isinstance(ccds, list) and any(isinstance(ccd, dict) for ccd in ccds)
+    return has_ccds or not {"pixel_um", "pixels"}.isdisjoint(content)
 
 
 def read_camera(path: Path) -> Camera:

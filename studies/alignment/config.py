@@ -16,10 +16,8 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field
 
 from ...core.arguments import check_arguments
-from ...core.errors import ConfigError
 from ...core.schema import Count, NotNegative, Positive, Section, Switch, Whole, plain_number, validated
-from ...core.yaml_reader import read_mapping
-from ...pipeline.config import section_yaml
+from ...pipeline.config import read_configuration, section_yaml
 
 Heights = Literal["nominal", "lsstcam"]
 
@@ -105,4 +103,4 @@ def load_align_configuration(path: Path) -> AlignConfig:
     ConfigError
         If the file cannot be read, is not YAML, or has an unknown key or a value out of range.
     """
-    return validated(AlignConfig, read_mapping(path, ConfigError), str(path))
+    return validated(AlignConfig, read_configuration(path), str(path))

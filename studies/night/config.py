@@ -18,8 +18,7 @@ from pydantic import BeforeValidator, Field
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, ProductError
 from ...core.schema import Section, Switch, Whole, plain_number, validated
-from ...core.yaml_reader import read_mapping
-from ...pipeline.config import Configuration, digest, section_yaml, with_run
+from ...pipeline.config import Configuration, digest, read_configuration, section_yaml, with_run
 from ...pipeline.experiment import Experiment
 from ...sky.visit_list.read_list import read_visit_list
 from ...sky.visit_list.visit_list import VisitList
@@ -109,7 +108,7 @@ def load_night_configuration(path: Path) -> NightConfig:
 
     ConfigError if a file cannot be read, is not YAML, or has an unknown key or a value out of range.
     """
-    return validated(NightConfig, with_run(read_mapping(path, ConfigError), path), str(path))
+    return validated(NightConfig, with_run(read_configuration(path), path), str(path))
 
 
 def read_section(settings: ListSection, run: Configuration, folder: Path | None = None) -> VisitList:

@@ -18,11 +18,18 @@ from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, mode
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, error_context
 from ...core.schema import Count, Real, Section, Whole, plain_number, validated
-from ...core.yaml_reader import read_mapping
 from ...imaging.config import GalaxySourceConfig
 from ...imaging.exposure import Exposure
 from ...imaging.galaxies import GalaxySource
-from ...pipeline.config import Configuration, PointingConfig, digest, section_yaml, with_options, with_run
+from ...pipeline.config import (
+    Configuration,
+    PointingConfig,
+    digest,
+    read_configuration,
+    section_yaml,
+    with_options,
+    with_run,
+)
 from ...pipeline.experiment import Experiment
 from ...pipeline.listed_visit import telescope_of_band
 from ...pipeline.resolved_values import require_drawn_stars
@@ -228,6 +235,6 @@ def load_visits_configuration(path: Path) -> VisitsConfig:
     ConfigError
         If a file cannot be read, is not YAML, or has an unknown key or a value out of range.
     """
-    config = validated(VisitsConfig, with_run(read_mapping(path, ConfigError), path), str(path))
+    config = validated(VisitsConfig, with_run(read_configuration(path), path), str(path))
     with error_context(file=path):
         return config.model_copy(update={"galaxies": config.galaxies.with_files(path.parent)})

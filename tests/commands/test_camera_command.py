@@ -63,3 +63,22 @@ def test_bad_input_is_one_line(capsys, arguments, part):
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("pachon: error: ")
     assert part in line
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("camera", "half.yaml: pixel_um is missing"),
+        ("run", "half.yaml: a camera file; expected a configuration"),
+        ("align", "half.yaml: a camera file; expected a configuration"),
+        ("images", "half.yaml: a camera file; expected a configuration"),
+        ("donuts", "half.yaml: expected FITS files of stamps"),
+    ],
+)
+def test_a_camera_file_without_pixel_um_is_one_all_the_same(command, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "half.yaml").write_text("name: half\nsource: a drawing\nccds: [{name: A1, x_mm: 0, y_mm: 0}]\n")
+    assert main([command, "half.yaml"]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert words in err

@@ -28,7 +28,7 @@ PATHS = {
     for path in sorted((DOCS / folder).glob("*.md"))
 }
 #: Pages that the build makes, as seen from the folder of the reference.
-GENERATED = ("api/index.md", "commands/index.md")
+GENERATED = ("commands/index.md",)
 PAGES = {name: path.read_text(encoding="utf-8") for name, path in PATHS.items()}
 BLOCK = re.compile(r"```python\n(.*?)```", flags=re.S)
 LENSES = Path(__file__).parents[1] / "data" / "zmx"

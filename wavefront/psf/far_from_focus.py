@@ -54,7 +54,7 @@ def check_stamp(optics: PupilOptics, plane: ImagePlane) -> None:
         needed = 2 * int(np.ceil(1.1 * reach / plane.pixel_size)) + 1
         x, y = np.rad2deg(optics.fields[star])
         raise DomainError(
-            f"stamps: size = {plane.size}: {100.0 * lost[star]:.0f} % of the light of the star at field ({x:.4g}, "
-            f"{y:.4g}) deg falls beside the stamp; expected at least {needed} pixels, or a telescope in focus "
-            "(pachon focus)"
+            f"stamps: size = {plane.size} (psf.stamp of a configuration): {100.0 * lost[star]:.0f} % of the light of "
+            f"the star at field ({x:.4g}, {y:.4g}) deg falls beside the stamp; expected at least "
+            f"{needed} pixels, or a telescope in focus (pachon focus)"
         )
