@@ -57,8 +57,9 @@ def served(source, port):
 def address():
     with served("lsst_v3.3_r", 5306) as (url, ending):
         yield url
-    # Ctrl-C ends it, without a word.
-    assert ending == [0, "", ""]
+    # Ctrl-C ends it, without a word; the port may have been another program's.
+    assert ending[:2] == [0, ""]
+    assert ending[2] in ("", "port 5306 is taken; the next free one is used\n")
 
 
 @pytest.fixture(scope="module")
