@@ -110,7 +110,7 @@ def open_desk(
         Bundled telescope, its file, a state that a desk saved, the folder of a run, of visits or of tolerances, the
         store of a sweep, a table of donuts, the file of a focal-plane model, a telescope, or a result of
         :func:`~pachon.monte_carlo`, :func:`~pachon.run_tolerances`, :func:`~pachon.fit_donuts` or
-        :meth:`FocalPlanePsf.fit`. States of a telescope name its file
+        :meth:`~pachon.FocalPlanePsf.fit`. States of a telescope name its file
         ``NAME.yaml``, which :func:`~pachon.save_telescope` writes.
 
     Raises

@@ -76,9 +76,9 @@ class NightBench:
         ra, dec = (np.concatenate([v.detectors[name] for v in self.visits.values()]) for name in ("ra", "dec"))
         #: Middle of all CCDs on the sky, right ascension and declination [deg].
         self.center = math.degrees(float(np.angle(np.exp(1j * np.deg2rad(ra)).mean()))), float(np.median(dec))
-        paths = {_map_name(path): path for path in sorted(folder.glob(f"{_MAP}*{_BETWEEN}*.hsp"))}
+        files = {_map_name(path): path for path in sorted(folder.glob(f"{_MAP}*{_BETWEEN}*.hsp"))}
         #: Files of the maps by quantity and band, sizes of PSFs first.
-        self.maps = dict(sorted(paths.items(), key=lambda item: not item[0].startswith("psf_size")))
+        self.maps = dict(sorted(files.items(), key=lambda item: not item[0].startswith("psf_size")))
 
     @property
     def start(self) -> NightState:

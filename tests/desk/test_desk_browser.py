@@ -57,8 +57,9 @@ def served(source, port):
 def address():
     with served("lsst_v3.3_r", 5306) as (url, ending):
         yield url
-    # Ctrl-C ends it, without a word.
-    assert ending == [0, "", ""]
+    # Ctrl-C ends it, without a word; the port may have been another program's.
+    assert ending[:2] == [0, ""]
+    assert ending[2] in ("", "port 5306 is taken; the next free one is used\n")
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +84,7 @@ def new_page(address, browser):
         page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
         page.on("pageerror", lambda error: problems.append(str(error)))
         page.on("request", lambda request: hosts.add(urlsplit(request.url).hostname))
-        page.goto(f"{address}?theme={theme}")
+        page.goto(f"{address}?theme={theme}", timeout=PATIENCE)
         page.wait_for_function(f"({TEXT})().includes('FWHM')", timeout=PATIENCE)
         pages.append(page)
         return page
@@ -198,7 +199,7 @@ def test_an_exported_page_needs_nothing_else(browser, tmp_path):
     requests, problems = [], []
     page.on("request", lambda request: requests.append(request.url))
     page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
-    page.goto(target.as_uri())
+    page.goto(target.as_uri(), timeout=PATIENCE)
     page.wait_for_function("() => document.querySelectorAll('.bk-Figure').length == 8", timeout=PATIENCE)
     assert "M2_dx: 300.0" in page.content()
     assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
@@ -211,7 +212,7 @@ def test_the_desk_of_a_run_draws_its_stars_and_a_clicked_ccd(finished_run, brows
         page, problems, hosts = browser.new_page(), [], set()
         page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
         page.on("request", lambda request: hosts.add(urlsplit(request.url).hostname))
-        page.goto(url)
+        page.goto(url, timeout=PATIENCE)
         page.wait_for_function(f"({TEXT})().includes('ellipticity')", timeout=PATIENCE)
         bench = RunBench(finished_run)
         for kind in list(KINDS)[::-1]:
@@ -244,7 +245,7 @@ def test_pages_of_results_draw_without_errors(browser, tmp_path):
     for source, pictures in sources.items():
         target = tmp_path / "desk.html"
         pachon.open_desk(source).export(target)
-        page.goto(target.as_uri())
+        page.goto(target.as_uri(), timeout=PATIENCE)
         count = "n => document.querySelectorAll('.bk-Figure').length == n"
         page.wait_for_function(count, arg=pictures, timeout=PATIENCE)
         assert page.evaluate("() => document.documentElement.scrollWidth") <= 700, source
@@ -260,7 +261,7 @@ def test_a_box_in_one_plot_of_a_sweep_selects_in_all_and_a_point_opens(browser, 
         page, problems, hosts = context.new_page(), [], set()
         context.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
         context.on("request", lambda request: hosts.add(urlsplit(request.url).hostname))
-        page.goto(url)
+        page.goto(url, timeout=PATIENCE)
         page.wait_for_function(f"({TEXT})().includes('fwhm')", timeout=PATIENCE)
         page.wait_for_function("() => document.querySelectorAll('.bk-Figure').length == 4", timeout=PATIENCE)
         bench = SweepBench(path)
@@ -287,7 +288,7 @@ def test_a_box_in_one_plot_of_a_sweep_selects_in_all_and_a_point_opens(browser, 
         opened = opening.value
         assert opened.url.endswith(f"?point={number}")
         wait_for(opened, expected(bench.opened(number)[1], bench.opened(number)[0]))
-        page.goto(f"{url}?point=x")
+        page.goto(f"{url}?point=x", timeout=PATIENCE)
         page.wait_for_selector("text=expected a whole number", timeout=PATIENCE)
         context.close()
     assert problems == []
