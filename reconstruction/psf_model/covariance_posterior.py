@@ -130,9 +130,10 @@ class Posterior:
     def of(cls, ccds: Sequence[StarNumbers], middle: np.ndarray, width: np.ndarray, colour_count: int = 0) -> Self:
         """Return it for CCDs of one :attr:`StarNumbers.filled_count`."""
         counts = np.array([len(ccd.noise) for ccd in ccds])
-        arrays = [np.stack(values) for values in zip(*(ccd.filled() for ccd in ccds), strict=True)]
-        real = np.arange(arrays[0].shape[1]) < counts[:, None]
-        return cls(*arrays, real, middle, width, colour_count)
+        filled = [ccd.filled() for ccd in ccds]
+        distance, numbers, noise, terms = (np.stack(values) for values in zip(*filled, strict=True))
+        real = np.arange(noise.shape[1]) < counts[:, None]
+        return cls(distance, numbers, noise, terms, real, middle, width, colour_count)
 
     def kernels(self, logarithms: np.ndarray, present: np.ndarray) -> np.ndarray:
         """Return the columns [..., n_columns], those that are not present as 0 but for the length."""

@@ -104,7 +104,7 @@ class FieldOptics:
         displacement = beside + rise[..., None] * inclined
         jacobian = jacobian.reshape(-1, 2, 2)
         if aberration is not None:
-            gradient = aberration.gradient(*self.pupil.T, slopes)
+            gradient = aberration.gradient(self.pupil[:, 0], self.pupil[:, 1], slopes)
             displacement -= (jacobian[:, None, :, 0] * gradient[..., :1] + jacobian[:, None, :, 1] * gradient[..., 1:])[
                 :, None
             ]
@@ -169,10 +169,11 @@ def _field_optics(
         return None
     for reach in _REACHES:
         radius = math.tan(min(reach * telescope.field_radius, telescope.field_limit, _LARGEST_FIELD))
-        traced = [_traced(telescope, wavelengths, pupil, radius * places) for places in (_places(), _spiral())]
-        if any(values is None for values, _ in traced):
+        (values, onward), (checks, _) = (
+            _traced(telescope, wavelengths, pupil, radius * places) for places in (_places(), _spiral())
+        )
+        if values is None or checks is None:
             continue
-        (values, onward), (checks, _) = traced
         with one_blas_thread():
             coefficients = np.linalg.lstsq(_terms(_places()), values, rcond=None)[0]
         error = np.abs(sums_of_products(_terms(_spiral()), coefficients) - checks).max(axis=0)
@@ -219,7 +220,7 @@ def _traced(
     and their slopes, all in the frame of the detector, and squared distances at apertures. None where a ray is lost, or
     the detector is curved.
     """
-    direction = field_direction(*slopes.T, "gnomonic")
+    direction = field_direction(slopes[:, 0], slopes[:, 1], "gnomonic")
     middle, detector, points = wavelengths[len(wavelengths) // 2], telescope.surfaces[-1], pupil.points
 
     def landing(wavelength: float, points: np.ndarray) -> np.ndarray:
