@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer import Option
 
+from ..core.number_text import NumberText
 from ..core.terminal import print_line
 from .choices import choice
 from .options import Config, Json, Quiet, TableFile, Threads, set_option
@@ -106,27 +107,32 @@ def _state_rows(summary: dict[str, Any], sentence: str) -> Rows:
     rows = [
         (
             "as designed",
-            f"{summary['designed_wavefront_nm']:.0f}",
+            NumberText(summary["designed_wavefront_nm"], ".0f"),
             "0",
             "0.0",
             "0.0",
-            f"{1e3 * summary['designed_rms_g']:.2f}",
-            f"{1e3 * summary['designed_rms_e']:.2f}",
+            NumberText(1e3 * summary["designed_rms_g"], ".2f"),
+            NumberText(1e3 * summary["designed_rms_e"], ".2f"),
         ),
-        ("floor", f"{summary['floor_wavefront_nm']:.0f}", f"{summary['floor_added_nm']:.0f}", *_NO_IMAGES),
+        (
+            "floor",
+            NumberText(summary["floor_wavefront_nm"], ".0f"),
+            NumberText(summary["floor_added_nm"], ".0f"),
+            *_NO_IMAGES,
+        ),
         (
             "late visits",
-            f"{summary['late_wavefront_nm']:.0f}",
-            f"{summary['late_added_nm']:.0f}",
-            f"{summary['late_fwhm_added_mas']:.1f}",
-            f"{100 * summary['late_t_added_arcsec2'] / summary['designed_t_arcsec2']:.1f}",
-            f"{1e3 * summary['late_rms_g']:.2f}",
-            f"{1e3 * summary['late_rms_e']:.2f}",
+            NumberText(summary["late_wavefront_nm"], ".0f"),
+            NumberText(summary["late_added_nm"], ".0f"),
+            NumberText(summary["late_fwhm_added_mas"], ".1f"),
+            NumberText(100 * summary["late_t_added_arcsec2"] / summary["designed_t_arcsec2"], ".1f"),
+            NumberText(1e3 * summary["late_rms_g"], ".2f"),
+            NumberText(1e3 * summary["late_rms_e"], ".2f"),
         ),
         (
             "worst late visit",
-            f"{summary['late_worst_wavefront_nm']:.0f}",
-            f"{summary['late_worst_added_nm']:.0f}",
+            NumberText(summary["late_worst_wavefront_nm"], ".0f"),
+            NumberText(summary["late_worst_added_nm"], ".0f"),
             *_NO_IMAGES,
         ),
     ]

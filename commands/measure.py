@@ -9,6 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
+from ..core.number_text import NumberText
 from . import completion
 from .choices import choice, names
 from .inputs import load_model
@@ -200,13 +201,13 @@ def _image_rows(measured: MeasuredFiles) -> Rows:
             str(m["objects"]),
             str(m["stars"]),
             str(m["usable"]),
-            "" if density is None else f"{density:.1f}",
+            "" if density is None else NumberText(density, ".1f"),
         ]
         if "purity" in m:
             row += [
                 f"{m['star_completeness']:.2f}, {m['star_purity']:.2f}",
                 str(m["magnitude_half_complete"]),
-                f"{m['purity']:.3f}",
+                NumberText(m["purity"], ".3f"),
             ]
         rows.append(row)
     has_truth = any("purity" in m for m in measured.metrics.values())

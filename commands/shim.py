@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 from typer import Option
 
+from ..core.number_text import NumberText
 from ..core.terminal import print_line
 from . import completion
 from .choices import choice, names
@@ -107,12 +108,12 @@ def _state_rows(shims: Shims) -> Rows:
     rows = [
         (
             state,
-            f"{m.fwhm:.4f}",
+            NumberText(m.fwhm, ".4f"),
             f"{1e3 * (m.fwhm - reference):+.2f}",
-            f"{m.size:.4f}",
-            f"{1e3 * m.rms_g:.2f}",
-            f"{1e6 * m.rms_xi_g:.2f}",
-            f"{1e3 * m.rms_e:.2f}",
+            NumberText(m.size, ".4f"),
+            NumberText(1e3 * m.rms_g, ".2f"),
+            NumberText(1e6 * m.rms_xi_g, ".2f"),
+            NumberText(1e3 * m.rms_e, ".2f"),
         )
         for state, m in ((state, checked[state]) for state in STATES)
     ]

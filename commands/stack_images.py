@@ -9,6 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError, PachonError
+from ..core.number_text import NumberText
 from ..core.terminal import print_line
 from .options import Json, Quiet, TableFile, Threads
 from .tables import Rows, print_json, write_rows
@@ -92,7 +93,7 @@ def _stack_rows(metrics: dict[str, dict[str, Any]]) -> Rows:
     rows = []
     for visits, stack_metrics in metrics.items():
         densities = [
-            f"{stack_metrics[key]:.1f}"
+            NumberText(stack_metrics[key], ".1f")
             for key in ("detected_per_arcmin2", "usable_per_arcmin2", "usable_per_arcmin2_stamps")
         ]
         if stack_metrics["pairs"]:

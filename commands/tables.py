@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ..core.number_text import NumberText
 from ..core.terminal import print_line, terminal_json, terminal_text
 
 
@@ -126,7 +127,7 @@ class Rows:
         for heading, *cells in zip(self.headings, *self.rows, strict=True):
             name, unit = _name_and_unit(heading)
             if path.suffix.lower() == ".fits":
-                name, cells = _ascii(name), [_ascii(cell) for cell in cells]
+                name, cells = _ascii(name), [c if isinstance(c, NumberText) else _ascii(c) for c in cells]
             for suffix, values in _plain_columns(cells).items():
                 column = _unused(name + suffix, table.colnames)
                 table[column] = values
@@ -170,9 +171,16 @@ def _plain_column(cells: list[str]) -> list[float] | list[str]:
     if not any(cell not in ("", "-") for cell in cells):
         return [math.nan] * len(cells)
     try:
-        return [math.nan if cell in ("", "-") else float(cell) for cell in cells]
+        return [_number_of(cell) for cell in cells]
     except ValueError:
         return list(cells)
+
+
+def _number_of(cell: str) -> float:
+    """Return the number of a cell, in full where it is known; NaN for dashes and empty ones."""
+    if isinstance(cell, NumberText):
+        return cell.value
+    return math.nan if cell in ("", "-") else float(cell)
 
 
 def _unused(name: str, names: Sequence[str]) -> str:
@@ -216,16 +224,9 @@ def print_json(content: Any) -> None:
 def number_texts(values: Iterable[Any], form: str) -> list[str]:
     """Return numbers in a format, pairs with a comma, zeros without a minus sign, NaN as a dash; text as it is."""
     return [
-        v if isinstance(v, str) else ", ".join(number_texts(v, form)) if hasattr(v, "__len__") else _number(v, form)
+        v if isinstance(v, str) else ", ".join(number_texts(v, form)) if hasattr(v, "__len__") else NumberText(v, form)
         for v in values
     ]
-
-
-def _number(value: float, form: str) -> str:
-    if math.isnan(value):
-        return "-"
-    text = format(value, form)
-    return format(0.0, form) if float(text) == 0.0 else text
 
 
 class PlainConsole(Console):

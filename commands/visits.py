@@ -9,6 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
+from ..core.number_text import NumberText
 from ..core.terminal import print_line
 from . import completion
 from .choices import names
@@ -280,8 +281,8 @@ def _null_rows(metrics_by_visits: dict[str, dict[str, float]]) -> Rows:
             f"{metrics[name]:.4f} ± {metrics[f'{name}_error']:.4f}"
             for name in ("m1_model", "c1_model", "m1_true", "c1_true")
         ]
-        density = f"{metrics['usable_per_arcmin2']:.1f}"
-        rows.append((visits, density, *(f"{metrics[key]:.1e}" for key in keys), *biases))
+        density = NumberText(metrics["usable_per_arcmin2"], ".1f")
+        rows.append((visits, density, *(NumberText(metrics[key], ".1e") for key in keys), *biases))
     headings = ("visits", "per arcmin²", "|ξ+|", "shot noise", "difference", "m1", "c1", "m1 true", "c1 true")
     return Rows(headings, rows, _NULL_CAPTION, verdict=null_verdict(metrics_by_visits))
 

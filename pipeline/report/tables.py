@@ -7,6 +7,7 @@ from typing import Any
 
 from astropy.table import Table
 
+from ...core.number_text import NumberText
 from ...measure.correlation import SEPARATION_RANGES
 from ...models.camera.camera import Camera
 from ...models.camera.height_statistics import HeightStatistics
@@ -184,8 +185,8 @@ def per_ccd(summary: dict[str, Any]) -> list[tuple[str, ...]]:
     return [
         (
             name,
-            f"{f['field_deg']:.2f}",
-            f"{f['fwhm_arcsec']:.3f}",
+            NumberText(f["field_deg"], ".2f"),
+            NumberText(f["fwhm_arcsec"], ".3f"),
             _percent_number(f["mean_g_truth"]),
             _percent_number(f["rms_scatter_g"]),
             _percent_number(f["rms_residual_g_at_stars"]),
@@ -309,7 +310,7 @@ def percent(fraction: float) -> str:
 
 
 def _percent_number(value: float) -> str:
-    return f"{100 * value:.2f}" if math.isfinite(value) else "-"
+    return NumberText(100 * value, ".2f") if math.isfinite(value) else "-"
 
 
 def _percent(value: float) -> str:

@@ -1,13 +1,16 @@
 """Tables of commands as files: numbers with units, errors in columns of their own, names that each format can hold."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from astropy.table import Table
 from astropy.units import Unit
 
-from pachon.commands.tables import Rows
+from pachon.commands import measure
+from pachon.commands.tables import Rows, number_texts
+from pachon.pipeline.report.tables import per_ccd
 
 ROWS = Rows(
     ("CCD", "ξ+ [µm]", "m1", "", "rms [waves]", "light [%]", ""),
@@ -49,3 +52,33 @@ def test_a_table_without_rows_is_written(tmp_path):
 def test_the_verdict_stands_above(capsys):
     ROWS.show()
     assert capsys.readouterr().out.startswith("Two rows.\nCCD ")
+
+
+@pytest.mark.parametrize("ending", ["ecsv", "csv", "fits"])
+def test_numbers_are_written_in_full_and_shown_rounded(ending, tmp_path, capsys):
+    values = [1.0 / 3.0, -1e-5 / 3.0, math.nan]
+    rows = Rows(("CCD", "fwhm [arcsec]"), [*zip("abc", number_texts(values, ".2f"), strict=True)])
+    path = tmp_path / f"t.{ending}"
+    rows.write(path)
+    column = Table.read(path).columns[1]
+    np.testing.assert_array_equal(np.ma.filled(np.ma.asarray(column, dtype=float), math.nan), values)
+    rows.show()
+    assert [line.split()[1] for line in capsys.readouterr().out.splitlines()[1:]] == ["0.33", "0.00", "-"]
+
+
+def test_tables_of_images_and_ccds_hold_numbers_in_full():
+    figures = {"objects": 4, "stars": 2, "usable": 1, "usable_per_arcmin2": 1.0 / 3.0}
+    measured = SimpleNamespace(metrics={"image": figures}, left_out=())
+    assert measure._image_rows(measured).rows[0][4].value == 1.0 / 3.0
+    keys = (
+        "mean_g_truth",
+        "rms_scatter_g",
+        "rms_residual_g_at_stars",
+        "rms_residual_g_left_out",
+        "rms_residual_g_away",
+    )
+    run = dict.fromkeys(("field_deg", "fwhm_arcsec", *keys, "truth_variance_in_components"), 1.0 / 3.0)
+    run |= {"kink_observed": 1, "kink_truth": 2, "stars_used": 3, "stars": 4}
+    _, field, width, *shapes = per_ccd({"ccd": {"R22_S11": run}})[0]
+    assert (field, width, field.value, width.value) == ("0.33", "0.333", 1.0 / 3.0, 1.0 / 3.0)
+    assert [text.value for text in shapes[: len(keys)]] == [100 * (1.0 / 3.0)] * len(keys)
