@@ -12,8 +12,11 @@ from .pictures import BACKGROUNDS, WhiskersPicture
 from .result_pictures import PlacesPicture, RowsPicture
 from .widgets import number_boxes, status_text
 
-#: Mark of a place: smallest and largest side, and that of all marks in a row together [pixels].
-_MARK, _MARKS = (5, 26), 250
+#: Side of the mark of a place, at least and at most [pixels].
+_LEAST_MARK = 5
+_LARGEST_MARK = 26
+#: Sides of all marks in a row together [pixels].
+_ROW = 250
 
 
 class FocalSession(PageSession):
@@ -28,7 +31,7 @@ class FocalSession(PageSession):
         self.whiskers = WhiskersPicture(
             1e3 * bench.reach, 1e3 * bench.spacing, heights=self.heights is not None, center_mm=(x, y)
         )
-        size = min(max(round(_MARKS * bench.spacing / (2.0 * bench.reach)), _MARK[0]), _MARK[1])
+        size = min(max(round(_ROW * bench.spacing / (2.0 * bench.reach)), _LEAST_MARK), _LARGEST_MARK)
         self.field = PlacesPicture("field", ("detector x [mm]", "detector y [mm]"), self.show_place, size=size)
         self.psf, self.components = RowsPicture("psf", "PSF"), RowsPicture("components", "Eigen-PSFs")
         self.pictures = (self.whiskers, self.field, self.psf, self.components)

@@ -26,8 +26,10 @@ from .views import WhiskersView
 _PLACES = ("visitId", "detector", "band", "ra", "dec", "expMidptMJD")
 #: Pixels of a map that are drawn, at most: finer ones are averaged.
 _MOST_PIXELS = 6000
-#: Beginning of the names of maps, and what stands between their words.
-_MAP, _BETWEEN = "deepCoadd_", "_consolidated_map_"
+#: Beginning of the names of maps.
+_MAP = "deepCoadd_"
+#: What stands in them between the quantity and its reduction.
+_BETWEEN = "_consolidated_map_"
 #: Choice of all visits, or of all bands.
 ALL = "all"
 
