@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.special import fresnel
 
 from ..core.errors import DomainError, PrescriptionWarning
+from ..core.statistics import FWHM_PER_RMS
 from ..models.telescope import Telescope
 from ..raytrace.rays import parallel_rays
 from .donut_rays import chief_landing, landing_of
@@ -35,14 +36,16 @@ _CELLS = 96
 _DIFFERENCE = 0.05
 #: Flags of donuts whose edges are not those of the pupil.
 _UNFIT = DonutFlag.BLENDED | DonutFlag.CUT_OFF | DonutFlag.OTHER_SIZE
-#: Least width of the lit ring over the FWHM of the blur, and least number of pixels in it.
-_LEAST_WIDTH, _LEAST_PIXELS = 1.0, 4.0
+#: Least width of the lit ring over the FWHM of the blur.
+_LEAST_WIDTH = 1.0
+#: Least width of the lit ring [pixels].
+_LEAST_PIXELS = 4.0
 #: Least signal of a ring of pixels at the inner edge over its noise.
 _LEAST_SIGNAL = 10.0
-#: Reach and points of a diffracting edge, in Fresnel's unit.
-_FAR, _POINTS = 20.0, 4001
-#: Full width at half maximum of a Gaussian over its rms.
-_FWHM_PER_RMS = 2.354820045
+#: Reach of a diffracting edge, in Fresnel's unit.
+_FAR = 20.0
+#: Points at which its light is computed.
+_POINTS = 4001
 
 
 def warn_of_other_hole(instrument: Instrument, solutions: dict[int, StarSolution], fit: DonutFit) -> None:
@@ -105,7 +108,7 @@ def _ratios(instrument: Instrument, light: StarLight, fit: DonutFit, i: int) -> 
     clear = (model[1] - model[0] > max(_LEAST_WIDTH * fwhm, _LEAST_PIXELS)) & (level > _LEAST_SIGNAL * noise)
     if not clear.all():
         return [np.full(_QUADRANTS, np.nan)] * 2
-    shift = _edge_shift(fwhm / _FWHM_PER_RMS, np.sqrt(0.5 * instrument.middle * abs(light.depth)) / pixel)
+    shift = _edge_shift(fwhm / FWHM_PER_RMS, np.sqrt(0.5 * instrument.middle * abs(light.depth)) / pixel)
     return [np.maximum(inner - shift, 0.0) / (outer + shift), model[0] / model[1]]
 
 
@@ -139,7 +142,7 @@ def _image(places: np.ndarray, weights: np.ndarray, size: int, fwhm: float) -> n
     """Return the light at places [n, 2] about the middle of a square of pixels, blurred by a Gaussian."""
     limits = [-0.5 * size, 0.5 * size]
     counts = np.histogram2d(places[:, 1], places[:, 0], bins=size, range=[limits, limits], weights=weights)[0]
-    return np.asarray(gaussian_filter(counts, fwhm / _FWHM_PER_RMS))
+    return np.asarray(gaussian_filter(counts, fwhm / FWHM_PER_RMS))
 
 
 def _edges(image: np.ndarray, used: np.ndarray, center: np.ndarray) -> tuple[float, float, float]:

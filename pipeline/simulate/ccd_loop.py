@@ -90,7 +90,7 @@ def simulate_ccds(
             if isinstance(model, ModelTogether):
                 pending.append((ccds, modeller.submit(model.reduce, exposures)))
             else:
-                pending.append((ccds, modeller.submit(_one_by_one, model, exposures, strict)))
+                pending.append((ccds, modeller.submit(_one_by_one, model, exposures)))
 
         def collect() -> None:
             for ccds, future in pending:
@@ -119,14 +119,12 @@ def simulate_ccds(
     return simulated
 
 
-def _one_by_one(
-    model: Callable[[CcdExposure], _T], exposures: Sequence[CcdExposure], strict: bool
-) -> list[_T | PachonError]:
-    """Return results of CCDs, with the error of a CCD in its place; nothing after one that ends the loop."""
+def _one_by_one(model: Callable[[CcdExposure], _T], exposures: Sequence[CcdExposure]) -> list[_T | PachonError]:
+    """Return results of CCDs, with the error of a CCD in its place; nothing after a product that cannot be written."""
     results: list[_T | PachonError] = []
     for exposure in exposures:
         results.append(attempt(model, exposure))
-        if isinstance(results[-1], ProductError) or (strict and isinstance(results[-1], PachonError)):
+        if isinstance(results[-1], ProductError):
             break
     return results
 
