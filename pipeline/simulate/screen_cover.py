@@ -36,9 +36,9 @@ def corner_fields(telescope: Telescope, camera: Camera, names: Sequence[str]) ->
     """Return the field angles of the corners of CCDs [rad], [n, 2]; ConfigError names those beyond the field."""
 
     def fields(some: Sequence[str]) -> np.ndarray:
-        found = fields_at(telescope, camera.corners(camera.ccd_index(name) for name in some).reshape(-1, 2))
-        telescope.check_field(*found.T)
-        return found
+        angles = fields_at(telescope, camera.corners(camera.ccd_index(name) for name in some).reshape(-1, 2))
+        telescope.check_field(*angles.T)
+        return angles
 
     try:
         return fields(names)
