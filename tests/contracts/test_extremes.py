@@ -19,8 +19,8 @@ from test_wrong_arguments import LONG, is_numbers
 from pachon.core.errors import PachonError
 
 #: One of so many calls is made in the short run, and of functions that take a second.
-SHARE = 200
-SHARE_OF_COSTLY = 1000
+SHARE = 400
+SHARE_OF_COSTLY = 2000
 COSTLY = ("check_orientation", "choose_glasses", "fit_donuts", "shim")
 #: Packages of public functions, each a part of the long run.
 PACKAGES = ("core", "models", "raytrace", "wavefront", "design", "sky", "sensing", "measure", "reconstruction",

@@ -20,7 +20,7 @@ from public_names import public_functions
 from pachon.core.errors import PachonError
 
 #: Share of the calls in the short run.
-SHARE = 240
+SHARE = 480
 
 
 class Surprise:

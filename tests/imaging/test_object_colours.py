@@ -92,7 +92,7 @@ def test_round_galaxies_are_round_under_the_psf_of_their_colour(field):
     assert again.warnings == ("colours change nothing: the PSF model has no dependence on them",)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_command_takes_colours_from_a_table(field, tmp_path, capsys):
     _, folder, _, _, _ = field
     arguments = ["measure", str(folder / "image.fits"), "-o", str(tmp_path), "--recipe", "paper", "--basis", "pixels"]

@@ -198,7 +198,7 @@ def test_a_run_that_grows_models_all_ccds_again(focal_plane_config, tmp_path, pl
     assert contents(tmp_path / "grows") == contents(tmp_path / "at_once")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ccds_computed_apart_make_the_run_of_one_machine(focal_plane_config, tmp_path, plane_model, no_report):
     run(focal_plane_config(), tmp_path / "at_once")
     together = tmp_path / "together"

@@ -209,6 +209,7 @@ def test_a_ccd_that_cannot_be_modelled_is_left_out(finished_run, tmp_path, tiny,
     assert f"<li>CCD R22_S11: {failing_ccd}</li>" in (out / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_ccd_that_could_not_be_modelled_is_tried_again(
     finished_run, tmp_path, tiny, no_report, failing_ccd, monkeypatch
 ):

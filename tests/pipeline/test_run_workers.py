@@ -40,6 +40,7 @@ def test_workers_write_the_bytes_of_one_process(finished_run, tmp_path, tiny):
     assert result.computed == ("R22_S11", "R24_S12")
 
 
+@pytest.mark.slow
 def test_a_worker_that_does_not_see_the_folder_sends_its_product(finished_run, tmp_path, tiny):
     experiment = Experiment.from_config(tiny())
     computation = JobComputation(partial(compute_ccd, experiment), tmp_path, ".another_mark")

@@ -148,7 +148,7 @@ def test_errors_have_the_terms_that_are_left_out(behind_focus, wave, clean):
     assert chi2(bare, bare.covariance) < 10.0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_missing_terms_do_no_harm_where_they_are_expected(behind_focus):
     wave = np.zeros(23)
     wave[22] = 60e-9
@@ -227,7 +227,7 @@ def test_second_stars_are_survived(behind_focus, wave, ratio, offset):
     assert rss(error) < 4.0 * rss(fit.errors[0])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_second_stars_are_not_searched_for_where_there_are_none(behind_focus, wave):
     both = donut(behind_focus, FIELD, zernikes=wave)
     both = both + 0.3 * donut(behind_focus, FIELD, zernikes=wave, shift=(14.0, 9.0))
@@ -324,7 +324,7 @@ def test_empty_stamps_are_flagged_and_the_others_go_on(behind_focus, clean):
     cloud = gaussian_filter(rng.normal(size=flat.shape), 4.0)
     stamps = [
         *(empty_stamp(seed) for seed in (0, 1, 6, 7)),
-        *((flat + level, 0.0) for level in (0.0, 1.0, 50.0, 1e4, 1e19, -1.0, -1e3, -1e19)),
+        *((flat + level, 0.0) for level in (0.0, 50.0, 1e19, -1e19)),
         (-np.abs(rng.normal(0.0, 10.0, flat.shape)), 0.0),
         *((image, 100.0) for image in (hot, hot + rng.normal(0.0, 10.0, flat.shape))),
         (np.full_like(flat, np.nan), 0.0),
@@ -340,7 +340,7 @@ def test_empty_stamps_are_flagged_and_the_others_go_on(behind_focus, clean):
             behind_focus, images, [FIELD] * len(images), WAVELENGTH, sky_variance=variance, **options
         )
         # A donut, zeros, the most negative, NaN.
-        assert picture_bytes(fit.plot([0, 5, 12, 16]), "png")
+        assert picture_bytes(fit.plot([0, 5, 8, 12]), "png")
     assert fit.usable.tolist() == [True] + [False] * len(stamps)
     assert all(fit.reasons[1:])
     assert set(fit.reasons[1:5]) == {"no donut", "no donut, too few photons"}
@@ -587,7 +587,7 @@ def test_bad_options(kind, changes, text):
         kind(**changes)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_heights_of_ccds_and_several_wavelengths(behind_focus, clean):
     """A CCD that stands 30 um too high is a detector 30 um farther, whichever argument says so."""
     options = {"sky_variance": 500.0, "noll": range(4, 9), **OPTIONS}

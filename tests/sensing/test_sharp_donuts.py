@@ -53,7 +53,7 @@ def test_a_sharp_donut_costs_little_more_than_a_blurred_one(behind_focus, wave, 
     assert least[0.0] < 10.0 * least[2.0]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("blur", [0.0, 0.5])
 def test_free_seeing_of_sharp_donuts_converges(behind_focus, wave, bins, blur):
     fit, _ = fitted(behind_focus, drawn(bins, blur), None)

@@ -91,7 +91,7 @@ def test_images_of_rays_are_told_from_those_of_waves(behind_focus, blur):
     assert fit.summary()["diffraction"] is False
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_donuts_of_waves_are_told_from_those_of_rays(behind_focus):
     air = pachon.Atmosphere.from_site("cerro_pachon", seed=1)
     images = 5e6 * pachon.draw_donuts(behind_focus, FIELDS, [WAVELENGTH], atmosphere=air).psf.image

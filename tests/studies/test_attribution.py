@@ -168,6 +168,7 @@ def test_optics_off_leaves_the_air_alone(tiny):
     assert figures[OPTICS]["fwhm_arcsec"] == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_ccd_that_one_case_cannot_model_is_left_out_of_all(tiny, monkeypatch):
     options = {"psf__engine": "long_exposure"}
     alone = attribute(tiny(**options, ccds=("R22_S11",)), ("diffusion",), threads=1)
@@ -283,6 +284,7 @@ def test_bad_input_is_one_line(settings_file, tmp_path, capsys, arguments, parts
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_cases_have_the_focal_plane_model_that_a_run_has(focal_plane_config, plane_model, tmp_path):
     config = focal_plane_config()
     result = attribute(config, ("tilt", NOISE), threads=1)
@@ -326,6 +328,7 @@ OFF = {
 }
 
 
+@pytest.mark.slow
 def test_silicon_and_sensor_effects_are_causes_where_they_are_on(tiny):
     names = ("absorption_depth", "brighter_fatter", "tree_rings", "edge_rolloff")
     assert not set(names) & set(checked_causes(Experiment.from_config(tiny()).config))

@@ -43,6 +43,7 @@ def test_plan_adds_models_without_order_basis_and_components(tiny):
     assert (str(added[0]), str(added[-1])) == ("focal plane, no telescope", "focal plane")
 
 
+@pytest.mark.slow
 def test_metrics_are_those_of_one_model_of_all_ccds(small):
     config, result = small
     experiment = study_experiment(config, result.plan)
@@ -94,6 +95,7 @@ def test_too_few_stars_are_a_problem(small):
     assert set(problems.values()) == {"24 stars: expected at least 30"}
 
 
+@pytest.mark.slow
 def test_files_and_table_have_the_model(small, tmp_path, settings_file, capsys, monkeypatch):
     config, result = small
     write_study(result, tmp_path, config)

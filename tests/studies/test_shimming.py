@@ -129,7 +129,7 @@ def test_pair_sums_are_those_of_treecorr_and_their_derivatives_finite_difference
         assert slope[i, k] == pytest.approx(difference, rel=1e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_no_motion_of_a_grid_has_a_smaller_correlation(built):
     """Brute force over piston and tilts of a raft of three CCDs, with the correlation pair by pair."""
     found = shim(built, merit="xi", threads=1)

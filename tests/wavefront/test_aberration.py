@@ -147,7 +147,7 @@ def test_rms_over_pupil_field_and_exposures(lsst_r, annulus_points):
     assert np.mean(aberration.opd(x, y, places[0]) ** 2) == pytest.approx(expected, rel=0.02)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_amplitudes_fall_with_the_degree_and_half_the_variance_is_linear_in_the_field(lsst_r):
     drawn = [ResidualWavefront.draw(lsst_r, PAPER_RMS, seed=1, epoch=e) for e in range(2000)]
     constant = np.mean([a.coefficients**2 for a in drawn], axis=0)

@@ -75,6 +75,7 @@ def test_it_is_as_if_the_detector_had_moved(lsst_r):
         assert result.strehl[i, 0] == pytest.approx(-found.fun, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_the_best_focus_of_all_is_best(lsst_r):
     result = through_focus(lsst_r, None, np.linspace(*lsst_r.band, 3), np.linspace(-1e-5, 1e-5, 201))
     mean = np.sqrt((result.rms_radius**2).mean(axis=0))

@@ -254,7 +254,7 @@ def test_edges_are_held_where_the_light_goes_in_the_lens_as_it_is(typed, aiming)
         assert abs(edge.measure(changed) - replace(edge, radius=float(frozen)).measure(changed)) > 1e-5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_edge_is_held_on_the_optimum_as_it_is_saved(lens, tmp_path):
     """The lens before would go below it."""
     how = dict(

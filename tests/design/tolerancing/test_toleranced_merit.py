@@ -69,6 +69,7 @@ def test_quadratic_compensation_is_the_best_focus(triplet, built):
     assert best > 1.002 * built.nominal
 
 
+@pytest.mark.slow
 def test_methods_and_their_yields_agree(triplet):
     """Tolerances of good work: merits within 2 per cent of their spread, yields within their binomial errors."""
     how = dict(merit="spots", n=100, seed=2, compensators=["Image.dz"])

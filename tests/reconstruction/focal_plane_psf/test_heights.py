@@ -46,7 +46,7 @@ def test_legendre_terms_are_in_the_order_of_their_powers():
     np.testing.assert_allclose(found, expected, rtol=1e-14)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_prior_of_rafts_and_ccds_has_the_covariance_of_drawn_focal_planes(part):
     camera = part("R23", "R33")
     prior = HeightPrior.from_budget(camera)

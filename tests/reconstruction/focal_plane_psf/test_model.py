@@ -136,7 +136,7 @@ def test_a_planted_height_is_found(aligned, exposure):
     assert above(aligned.heights) == pytest.approx(truth, abs=3 * UM)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_known_heights_are_kept(exposure, few, lsst_r, wavelengths):
     model = FocalPlanePsf.fit(exposure.stars(few), Instrument.of(lsst_r, wavelengths), exposure.plane, prior=ALIGNED)
     x, y = exposure.xy.T
@@ -174,7 +174,7 @@ def test_a_telescope_whose_images_have_no_shape_gives_one_clear_line(exposure, f
 ELSEWHERE = (["R23_S00", "R23_S11", "R23_S11", "R23_S22"], [0.09, 0.12, 0.13, 0.16], [-0.04, 0.0, 0.01, 0.05])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_no_byte_depends_on_the_threads(aligned, exposure, few, lsst_r, wavelengths):
     two = FocalPlanePsf.fit(
         exposure.stars(few), Instrument.of(lsst_r, wavelengths), camera=exposure.camera, prior=ALIGNED, threads=2

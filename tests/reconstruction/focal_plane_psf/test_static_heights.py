@@ -65,7 +65,7 @@ def test_two_exposures_tell_the_heights_better_than_one(exposures, fit, both):
     assert (both[0].sigma > one[0].sigma / 2.0).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_covariances_are_those_of_the_legendre_terms(both, exposures):
     covariance = both[0].covariance
     assert covariance.shape == (4, len(powers(6)), len(powers(6)))

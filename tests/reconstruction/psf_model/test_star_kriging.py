@@ -53,7 +53,9 @@ def error(images, truth):
 
 @pytest.mark.long
 @pytest.mark.parametrize("rough", [0.0, 0.5, 2.0])
-@pytest.mark.parametrize("count", [20, 40, 100])
+@pytest.mark.parametrize(
+    "count", [pytest.param(20, marks=pytest.mark.slow), 40, pytest.param(100, marks=pytest.mark.slow)]
+)
 def test_it_is_near_to_the_best_of_all_choices_of_polynomials(count, rough):
     # What is best is found with the truth, anew for each field, which nobody has.
     ratios = []

@@ -259,6 +259,7 @@ def test_workers_with_another_version_are_refused():
         check_versions(Client())
 
 
+@pytest.mark.slow
 def test_points_that_cannot_be_computed_are_reported_and_the_others_go_on(folder, capsys):
     # A CCD at the rim of the field sees no light when M2 is moved by half a metre.
     text = SWEEP.replace("range: [-10, 10]", "values: [0, 3.0e+6]").replace("points: 14", "points: 6")

@@ -90,7 +90,7 @@ def test_offenders_and_quantiles(study):
     assert 0.0 < requirement.low < requirement.fraction < requirement.high < 1.0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_same_numbers_of_any_workers(triplet, study, tmp_path):
     """An interruption in the middle, and none: the same bytes of all products."""
     file, store = file_of(), tmp_path / "points"

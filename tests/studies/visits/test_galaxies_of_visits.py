@@ -111,7 +111,7 @@ def test_galaxies_of_a_catalogue_are_measured_where_and_as_it_says(folder, backw
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_galaxies_of_a_mosaic_are_planted_and_measured(folder):
     write_mosaic(folder / "own.fits", e=0.3)
     with_galaxies(folder, mosaic="own.fits", mosaic_psf_arcsec=0.05, density=0.01)

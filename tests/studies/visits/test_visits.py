@@ -129,6 +129,7 @@ def test_an_interrupted_stack_goes_on_to_the_same_bytes(stacked, visits_config, 
     assert content(tmp_path) == content(folder)
 
 
+@pytest.mark.slow
 def test_workers_that_end_visits_in_another_order_leave_the_same_bytes(stacked, visits_config, backwards, tmp_path):
     _, folder = stacked
     stack_visits(visits_config(), tmp_path, execution=Execution(workers=backwards))
