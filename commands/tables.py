@@ -136,7 +136,7 @@ class Rows:
             for key, values in _plain_columns(cells).items():
                 is_text = any(isinstance(value, str) for value in values)
                 if path.suffix.lower() == ".fits":
-                    name, values = _ascii(name), [_ascii(value) for value in values] if is_text else values
+                    name, values = _ascii(name), [_ascii(str(value)) for value in values] if is_text else values
                 column = _unused(name + key if not key or key.startswith("_") else key, table.colnames)
                 table[column] = values
                 if unit and not is_text:
@@ -166,7 +166,7 @@ def _name_and_unit(heading: str) -> tuple[str, Any]:
 
 def _plain_columns(cells: list[str]) -> dict[str, Sequence[float] | Sequence[str]]:
     """Return columns of cells by the keys of their values: cells of several values are as many."""
-    values = [cell.values if isinstance(cell, CellText) else {"": cell} for cell in cells]
+    values: list[dict[str, float | str]] = [cell.values if isinstance(cell, CellText) else {"": cell} for cell in cells]
     keys = dict.fromkeys(key for row in values for key in row if key or row[key] not in _NO_NUMBER) or {"": None}
     return {key: _plain_column([row.get(key, "") for row in values]) for key in keys}
 
