@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
@@ -114,7 +115,8 @@ def _listed(camera: Camera) -> _Content:
     content = {"camera": camera.name, "pixel_um": round(camera.pixel_size * 1e6, 9), "ccds": ccds}
     side = f"{camera.pixel_size * 1e6:.4g} µm"
     verdict = f"{camera.name} has {counted(len(camera), 'CCD')} with pixels of {side}."
-    table = Rows(CAMERA_COLUMNS, [[str(cell) for cell in row] for row in rows], CAMERA_CAPTION, verdict=verdict)
+    headings = [re.sub(r"_(mm|deg)$", r" [\1]", name) for name in CAMERA_COLUMNS]
+    table = Rows(headings, [[str(cell) for cell in row] for row in rows], CAMERA_CAPTION, verdict=verdict)
     return table, content, lambda: camera_plot(camera)
 
 

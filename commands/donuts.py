@@ -46,6 +46,8 @@ _FRAMES = "Frames and conventions"
 _FIT = "Fit"
 _SIMULATION = "Simulated donuts"
 _OUTPUT = "Output"
+#: Options with an opposite, whose two names are as wide as others with their values.
+_CHOICES = "Diffraction and orientation"
 #: Field angle from which on a donut tells its orientation, as a fraction of the telescope's field.
 _OFF_AXIS = 0.25
 #: Donuts that are enough for a check of orientation wherever they stand.
@@ -176,7 +178,7 @@ def donuts_command(
         bool | None,
         Option(
             help="Diffraction at the rims of the pupil: by default where it fits the images better than rays do.",
-            rich_help_panel=_FIT,
+            rich_help_panel=_CHOICES,
         ),
     ] = None,
     stamp_axes: Annotated[
@@ -219,7 +221,7 @@ def donuts_command(
     ] = "pachon",
     orientation_check: Annotated[
         bool,
-        Option(help="Warn where mirrored or turned stamps fit better; 1 to 3 s.", rich_help_panel=_FRAMES),
+        Option(help="Warn where mirrored or turned stamps fit better; 1 to 3 s.", rich_help_panel=_CHOICES),
     ] = True,
     projection: Projection = "zemax",
     simulate: Annotated[

@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
-from ..core.number_text import NumberText
+from ..core.number_text import CellText, NumberText
 from . import completion
 from .choices import choice, names
 from .inputs import load_model
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 _CAPTION = "Completeness and purity of the stars; magnitude at which half of the objects are found; purity of all."
-_HEADINGS = ("image", "objects", "stars", "usable", "per arcmin²", "complete, pure", "half [mag]", "purity")
+_HEADINGS = ("image", "objects", "stars", "usable", "density [1/arcmin²]", "complete, pure", "half [mag]", "purity")
 #: Columns of images without the truth.
 _COLUMNS = 5
 
@@ -205,8 +205,11 @@ def _image_rows(measured: MeasuredFiles) -> Rows:
         ]
         if "purity" in m:
             row += [
-                f"{m['star_completeness']:.2f}, {m['star_purity']:.2f}",
-                str(m["magnitude_half_complete"]),
+                CellText(
+                    f"{m['star_completeness']:.2f}, {m['star_purity']:.2f}",
+                    {"star completeness": m["star_completeness"], "star purity": m["star_purity"]},
+                ),
+                "" if m["magnitude_half_complete"] is None else str(m["magnitude_half_complete"]),
                 NumberText(m["purity"], ".3f"),
             ]
         rows.append(row)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Option
 
 from ..core.errors import ConfigError
+from ..core.number_text import NumberText
 from ..core.terminal import print_line
 from . import completion
 from .choices import names
@@ -145,8 +146,8 @@ def _band_rows(result: NightResult) -> Rows:
     rows = [
         (
             band,
-            f"{metrics['detectors']:.0f}",
-            *(f"{metrics.get(key, float('nan')):{form}}" for key, form in columns.values()),
+            NumberText(metrics["detectors"], ".0f"),
+            *(NumberText(metrics.get(key, float("nan")), form) for key, form in columns.values()),
         )
         for band, metrics in result.summary["bands"].items()
     ]

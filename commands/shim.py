@@ -109,7 +109,7 @@ def _state_rows(shims: Shims) -> Rows:
         (
             state,
             NumberText(m.fwhm, ".4f"),
-            f"{1e3 * (m.fwhm - reference):+.2f}",
+            NumberText(1e3 * (m.fwhm - reference), "+.2f"),
             NumberText(m.size, ".4f"),
             NumberText(1e3 * m.rms_g, ".2f"),
             NumberText(1e6 * m.rms_xi_g, ".2f"),

@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError, PachonError
-from ..core.number_text import NumberText
+from ..core.number_text import NumberText, number_with_error
 from ..core.terminal import print_line
 from .options import Json, Quiet, TableFile, Threads
 from .tables import Rows, print_json, write_rows
@@ -98,10 +98,16 @@ def _stack_rows(metrics: dict[str, dict[str, Any]]) -> Rows:
         ]
         if stack_metrics["pairs"]:
             error = stack_metrics["mean_difference_error"]
-            shifts = [f"{stack_metrics[f'mean_difference_{e}']:.4f} ± {error:.4f}" for e in ("e1", "e2")]
-            response = f"{stack_metrics['response_difference']:.3f} ± {stack_metrics['response_difference_error']:.3f}"
+            shifts = [number_with_error(stack_metrics[f"mean_difference_{e}"], error, ".4f") for e in ("e1", "e2")]
+            response = number_with_error(
+                stack_metrics["response_difference"], stack_metrics["response_difference_error"], ".3f"
+            )
         else:
             shifts, response = ["", ""], ""
         rows.append((visits, *densities, *shifts, response))
-    headings = ("visits", "detected", "usable", "on stamps", "e1 difference", "e2 difference", "response")
+    headings = (
+        "visits",
+        *(f"{name} [1/arcmin²]" for name in ("detected", "usable", "on stamps")),
+        *("e1 difference", "e2 difference", "response"),
+    )
     return Rows(headings, rows, _CAPTION, verdict=stack_verdict(metrics) if metrics else "")

@@ -9,6 +9,7 @@ import typer
 from typer import Option
 
 from ..core.errors import ConfigError
+from ..core.number_text import NumberText
 from ..core.terminal import print_line
 from .inputs import configured_experiment
 from .interrupt import interruptible
@@ -121,7 +122,7 @@ def _case_rows(result: Study) -> Rows:
     rows = []
     for case in dict.fromkeys(cases):
         if (case_metrics := result.metrics.get(case)) is not None:
-            rows.append((f"{case.stars} stars, {case}", *(f"{case_metrics[key]:.1e}" for key in _COLUMNS)))
+            rows.append((f"{case.stars} stars, {case}", *(NumberText(case_metrics[key], ".1e") for key in _COLUMNS)))
     return Rows(("model", *_COLUMNS.values()), rows, _CAPTION, verdict=_verdict(result))
 
 

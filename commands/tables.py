@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ..core.number_text import NumberText
+from ..core.number_text import CellText, NumberText
 from ..core.terminal import print_line, terminal_json, terminal_text
 
 
@@ -91,6 +91,13 @@ def range_text(values: Any, form: str, unit: str = "") -> str:
 _ASCII = {"µ": "u", "ξ": "xi", "²": "2", "³": "3", "°": " deg", "±": "+-", "Δ": "d", "λ": "lambda", "θ": "theta"}
 
 
+#: Cells without a number in columns of numbers.
+_NO_NUMBER = ("", "-")
+#: Text of a number; names such as 0_12 and 007 are none.
+_NUMBER = re.compile(r"[+-]?(?:(?!0\d)\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|[+-]?inf|nan", re.IGNORECASE)
+_WHOLE = re.compile(r"[+-]?\d+")
+
+
 @dataclass(frozen=True)
 class Rows:
     """A table as text."""
@@ -126,12 +133,13 @@ class Rows:
         table = AstropyTable()
         for heading, *cells in zip(self.headings, *self.rows, strict=True):
             name, unit = _name_and_unit(heading)
-            if path.suffix.lower() == ".fits":
-                name, cells = _ascii(name), [c if isinstance(c, NumberText) else _ascii(c) for c in cells]
-            for suffix, values in _plain_columns(cells).items():
-                column = _unused(name + suffix, table.colnames)
+            for key, values in _plain_columns(cells).items():
+                is_text = any(isinstance(value, str) for value in values)
+                if path.suffix.lower() == ".fits":
+                    name, values = _ascii(name), [_ascii(str(value)) for value in values] if is_text else values
+                column = _unused(name + key if not key or key.startswith("_") else key, table.colnames)
                 table[column] = values
-                if unit and not any(isinstance(value, str) for value in values):
+                if unit and not is_text:
                     table[column].unit = unit
         write_table(path, flat_table(table) if path.suffix.lower() in (".csv", ".parquet") else table)
 
@@ -156,31 +164,20 @@ def _name_and_unit(heading: str) -> tuple[str, Any]:
     return f"{match[1]}{match[3]}".strip() or "value", unit
 
 
-def _plain_columns(cells: list[str]) -> dict[str, list[float] | list[str]]:
-    """Return columns of cells by the ends of their names: numbers with an error behind ± or +- are two."""
-    pairs = [re.split(r" ?(?:±|\+-) ?", cell) for cell in cells]
-    if cells and all(len(pair) == 2 for pair, cell in zip(pairs, cells, strict=True) if cell not in ("", "-")):
-        values, errors = (_plain_column([(*pair, "", "")[k] for pair in pairs]) for k in (0, 1))
-        if any(len(pair) == 2 for pair in pairs):
-            return {"": values, "_error": errors}
-    return {"": _plain_column(cells)}
+def _plain_columns(cells: list[str]) -> dict[str, Sequence[float] | Sequence[str]]:
+    """Return columns of cells by the keys of their values: cells of several values are as many."""
+    values: list[dict[str, float | str]] = [cell.values if isinstance(cell, CellText) else {"": cell} for cell in cells]
+    keys = dict.fromkeys(key for row in values for key in row if key or row[key] not in _NO_NUMBER) or {"": None}
+    return {key: _plain_column([row.get(key, "") for row in values]) for key in keys}
 
 
-def _plain_column(cells: list[str]) -> list[float] | list[str]:
-    """Return the cells of a column as numbers, NaN for dashes and empty ones, or as text where they are none."""
-    if not any(cell not in ("", "-") for cell in cells):
-        return [math.nan] * len(cells)
-    try:
-        return [_number_of(cell) for cell in cells]
-    except ValueError:
-        return list(cells)
-
-
-def _number_of(cell: str) -> float:
-    """Return the number of a cell, in full where it is known; NaN for dashes and empty ones."""
-    if isinstance(cell, NumberText):
-        return cell.value
-    return math.nan if cell in ("", "-") else float(cell)
+def _plain_column(values: list[float | str]) -> Sequence[float] | Sequence[str]:
+    """Return the values of a column as numbers, NaN for dashes and empty ones, or as text where they are none."""
+    if not all(_NUMBER.fullmatch(value) for value in values if isinstance(value, str) and value not in _NO_NUMBER):
+        return [str(value) for value in values]
+    if all(_WHOLE.fullmatch(str(value)) for value in values):
+        return [int(value) for value in values]
+    return [math.nan if value in _NO_NUMBER else float(value) for value in values]
 
 
 def _unused(name: str, names: Sequence[str]) -> str:

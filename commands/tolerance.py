@@ -10,6 +10,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.file_names import file_name
+from ..core.number_text import number_with_unit
 from ..core.terminal import print_line
 from .choices import choice
 from .inputs import errors_of, load_model
@@ -101,14 +102,14 @@ def _offender_rows(summary: dict[str, Any], sentence: str) -> Rows:
     plain = f" {summary['unit']}" if summary["unit"] else ""
     rows = []
     for offender in summary["worst_offenders"]:
-        size_unit = "" if offender["unit"] == "1" else f" {offender['unit']}"
+        size_unit = "" if offender["unit"] == "1" else offender["unit"]
         ends = number_texts([offender["lower_end"], offender["upper_end"]], ".5g")
         rows.append(
             (
                 offender["name"],
-                f"{offender['size']:.4g}{size_unit}",
+                number_with_unit(offender["size"], ".4g", size_unit),
                 *ends,
-                f"{offender['size_for_the_loss']:.4g}{size_unit}",
+                number_with_unit(offender["size_for_the_loss"], ".4g", size_unit),
             )
         )
     headings = ("tolerance", "size", f"lower end{unit}", f"upper end{unit}", f"{summary['loss_percent']:g} % loss at")

@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
-from ..core.number_text import NumberText
+from ..core.number_text import NumberText, number_with_error
 from ..core.terminal import print_line
 from . import completion
 from .choices import names
@@ -219,7 +219,7 @@ def _stack_rows(stacks: dict[str, dict[str, float]]) -> Rows:
     }
     headings = ("visits", "points", *columns)
     rows = [
-        (visits, str(stack_metrics["points"]), *(f"{stack_metrics[key]:.1e}" for key in columns.values()))
+        (visits, str(stack_metrics["points"]), *(NumberText(stack_metrics[key], ".1e") for key in columns.values()))
         for visits, stack_metrics in stacks.items()
     ]
     return Rows(headings, rows, _CAPTION, verdict=visits_verdict(stacks))
@@ -278,12 +278,12 @@ def _null_rows(metrics_by_visits: dict[str, dict[str, float]]) -> Rows:
     rows = []
     for visits, metrics in metrics_by_visits.items():
         biases = [
-            f"{metrics[name]:.4f} ± {metrics[f'{name}_error']:.4f}"
+            number_with_error(metrics[name], metrics[f"{name}_error"], ".4f")
             for name in ("m1_model", "c1_model", "m1_true", "c1_true")
         ]
         density = NumberText(metrics["usable_per_arcmin2"], ".1f")
         rows.append((visits, density, *(NumberText(metrics[key], ".1e") for key in keys), *biases))
-    headings = ("visits", "per arcmin²", "|ξ+|", "shot noise", "difference", "m1", "c1", "m1 true", "c1 true")
+    headings = ("visits", "usable [1/arcmin²]", "|ξ+|", "shot noise", "difference", "m1", "c1", "m1 true", "c1 true")
     return Rows(headings, rows, _NULL_CAPTION, verdict=null_verdict(metrics_by_visits))
 
 
@@ -310,7 +310,7 @@ def _show_shears(metrics_by_visits: dict[str, dict[str, float]]) -> None:
             for name in names
         ]
         texts = [
-            f"{v:.1e} ± {error:.0e}" if "xi" in n else f"{v:.4f} ± {error:.4f}"
+            number_with_error(v, error, ".1e", ".0e") if "xi" in n else number_with_error(v, error, ".4f")
             for n, (v, error) in zip(names, figures, strict=True)
         ]
         rows.append((visits, str(metrics["shear_galaxies"]), *texts))

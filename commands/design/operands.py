@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Argument
 
 from ...core.errors import ConfigError, PachonError, error_context
+from ...core.number_text import NumberText
 from .. import completion
 from ..choices import names
 from ..inputs import load_model
@@ -56,12 +57,8 @@ def operands_command(
         return
     telescope = load_model(model, lenient, glass_catalogue or ())
     measured = _numbers(telescope, operand or [])
-    rows = [
-        [row["operand"], row["definition"], row["unit"], "" if row["number"] is None else f"{row['number']:.9g}"]
-        for row in measured
-    ]
-    named_rows = Rows(["operand", "definition", "unit", telescope.name], rows, left=3)
-    _deliver((named_rows, {"telescope": telescope.name, "operands": measured}), table, as_json)
+    json_content = {"telescope": telescope.name, "operands": measured}
+    _deliver((_number_rows(telescope.name, measured), json_content), table, as_json)
 
 
 def _deliver(content: tuple[Rows, dict[str, Any]], table: Path | None, as_json: bool) -> None:
@@ -73,6 +70,15 @@ def _deliver(content: tuple[Rows, dict[str, Any]], table: Path | None, as_json: 
         print_json(json_content)
     else:
         rows.show()
+
+
+def _number_rows(telescope: str, measured: list[dict[str, Any]]) -> Rows:
+    """Return measured operands as a table."""
+    rows = []
+    for operand in measured:
+        number = "" if operand["number"] is None else NumberText(operand["number"], ".9g")
+        rows.append((operand["operand"], operand["definition"], operand["unit"], number))
+    return Rows(("operand", "definition", "unit", telescope), rows, left=3)
 
 
 def _list_names() -> tuple[Rows, dict[str, Any]]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import DomainError, PachonError
+from ...core.number_text import CellText, NumberText
 from ...core.units import ARCSEC
 from ...models.aperture import Annulus, Circle, Complement
 from ...models.design_data import LENGTH_UNITS
@@ -172,10 +173,15 @@ def _clear_radii(surface: Surface) -> list[float | None] | None:
 
 def _clear_text(row: dict[str, Any], unit: float) -> str:
     if row["clear_m"] is None:
-        drawn = "" if row["semi_diameter_m"] is None else f"({row['semi_diameter_m'] / unit:.6g})"
-        return "another region" if row["aperture"] else drawn
-    inner, outer = row["clear_m"]
-    return f"from {inner / unit:g}" if outer is None else f"{inner / unit:g} to {outer / unit:g}"
+        if row["aperture"]:
+            return CellText("another region", {"_region": row["aperture"]})
+        if row["semi_diameter_m"] is None:
+            return ""
+        drawn = row["semi_diameter_m"] / unit
+        return CellText(f"({drawn:.6g})", {"_drawn": drawn})
+    inner, outer = (math.inf if radius is None else radius / unit for radius in row["clear_m"])
+    text = f"{inner:g} to {outer:g}" if math.isfinite(outer) else f"from {inner:g}"
+    return CellText(text, {"": outer, "_inner": inner})
 
 
 def surface_columns(description: dict[str, Any]) -> list[str]:
@@ -192,12 +198,12 @@ def surface_rows(description: dict[str, Any]) -> list[tuple[str, ...]]:
         (
             s["name"],
             ", ".join([s["type"], *(["stop"] if s["name"] == stop else [])]) + (" (tilted)" if s["tilted"] else ""),
-            "flat" if s["radius_m"] is None else f"{s['radius_m'] / unit:.7g}",
-            f"{s['conic']:g}" if s["conic"] else "",
-            "" if s["thickness_m"] is None else f"{s['thickness_m'] / unit:.7g}",
+            CellText("flat", {"": math.inf}) if s["radius_m"] is None else NumberText(s["radius_m"] / unit, ".7g"),
+            NumberText(s["conic"], "g") if s["conic"] else CellText("", {"": 0.0}),
+            "" if s["thickness_m"] is None else NumberText(s["thickness_m"] / unit, ".7g"),
             s["glass"],
-            f"{s['index_after']:.6f}" if s["medium_after"] else "",
-            f"{s['z_m'] / unit:.7g}",
+            NumberText(s["index_after"], ".6f") if s["medium_after"] else "",
+            NumberText(s["z_m"] / unit, ".7g"),
             _clear_text(s, unit),
         )
         for s in description["surfaces"]

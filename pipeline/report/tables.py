@@ -7,7 +7,7 @@ from typing import Any
 
 from astropy.table import Table
 
-from ...core.number_text import NumberText
+from ...core.number_text import CellText, NumberText, number_with_error
 from ...measure.correlation import SEPARATION_RANGES
 from ...models.camera.camera import Camera
 from ...models.camera.height_statistics import HeightStatistics
@@ -95,7 +95,7 @@ def _both(metrics: dict[str, Any], g: str, e: str) -> str:
 
 def _xi_plus(metrics: dict[str, Any], kind: str, name: str) -> str:
     """Return a mean xi+ with its error."""
-    return f"{_power(metrics[f'xi_plus_{kind}_{name}'])} ± {_power(metrics[f'error_xi_plus_{kind}_{name}'])}"
+    return number_with_error(metrics[f"xi_plus_{kind}_{name}"], metrics[f"error_xi_plus_{kind}_{name}"], ".1e")
 
 
 CAMERA_COLUMNS = ("ccd", "x_mm", "y_mm", "rotation_deg", "nx", "ny", "raft", "vendor")
@@ -192,9 +192,12 @@ def per_ccd(summary: dict[str, Any]) -> list[tuple[str, ...]]:
             _percent_number(f["rms_residual_g_at_stars"]),
             _percent_number(f["rms_residual_g_left_out"]),
             _percent_number(f["rms_residual_g_away"]),
-            percent(f["truth_variance_in_components"]).removesuffix(" %"),
-            f"{f['kink_observed']}, {f['kink_truth']}",
-            f"{f['stars_used']} of {f['stars']}",
+            _variance_text(f["truth_variance_in_components"]),
+            CellText(
+                f"{f['kink_observed']}, {f['kink_truth']}",
+                {"elbow observed": f["kink_observed"], "elbow noise-free": f["kink_truth"]},
+            ),
+            CellText(f"{f['stars_used']} of {f['stars']}", {"": f["stars_used"], "stars": f["stars"]}),
         )
         for name, f in summary["ccd"].items()
     ]
@@ -222,8 +225,11 @@ DIAGNOSTICS_CAPTION = (
 def diagnostics_rows(overall: dict[str, float]) -> list[tuple[str, ...]]:
     """Return a row for each kind of residual, in the columns of :data:`DIAGNOSTICS_COLUMNS`."""
 
+    def metric(key: str) -> float:
+        return overall.get(key, math.nan)
+
     def power(key: str) -> str:
-        return _power(overall.get(key, math.nan))
+        return _power(metric(key))
 
     names = {"residual": _NAMES["residual"], "left_out": "the same, star left out of the fit", "away": _NAMES["away"]}
     if "rms_e_away_ccd" in overall:
@@ -232,8 +238,8 @@ def diagnostics_rows(overall: dict[str, float]) -> list[tuple[str, ...]]:
         (
             name,
             *(power(f"{statistic}_{kind}") for statistic in ("mean_g1", "mean_g2", "rms_g", "mean_dt_g", "rms_dt_g")),
-            f"{power(f'largest_g_{kind}_xi_plus')} ± {power(f'largest_g_{kind}_error_plus')}",
-            f"{r:.1f}" if math.isfinite(r := overall.get(f"largest_g_{kind}_r_arcmin", math.nan)) else "-",
+            number_with_error(metric(f"largest_g_{kind}_xi_plus"), metric(f"largest_g_{kind}_error_plus"), ".1e"),
+            NumberText(metric(f"largest_g_{kind}_r_arcmin"), ".1f"),
             power(f"rms_e_{kind}"),
         )
         for kind, name in names.items()
@@ -258,8 +264,8 @@ def piff_rows(models: Table) -> list[tuple[str, ...]]:
 ATTRIBUTION_COLUMNS = (
     "off",
     "rms g [%]",
-    "at stars",
-    "holdout",
+    "at stars [%]",
+    "holdout [%]",
     "dT/T holdout [%]",
     "ξ+ of g, below 10'",
     "beyond",
@@ -284,9 +290,8 @@ def attribution_rows(metrics: dict[str, dict[str, float]]) -> list[tuple[str, ..
     def change(case_metrics: dict[str, float]) -> str:
         if "change_xi_plus_g_truth_long" not in case_metrics:
             return "-"
-        value = _power(case_metrics["change_xi_plus_g_truth_long"])
-        error = _power(case_metrics.get("error_xi_plus_g_truth_long", math.nan))
-        return f"{value} ± {error}"
+        error = case_metrics.get("error_xi_plus_g_truth_long", math.nan)
+        return number_with_error(case_metrics["change_xi_plus_g_truth_long"], error, ".1e")
 
     return [
         (
@@ -309,6 +314,11 @@ def percent(fraction: float) -> str:
     return f"{100 * fraction:.2f} %" if fraction < 0.99985 else "> 99.98 %"
 
 
+def _variance_text(fraction: float) -> str:
+    """Return a fraction in per cent, without the sign."""
+    return CellText(percent(fraction).removesuffix(" %"), {"": 100 * fraction})
+
+
 def _percent_number(value: float) -> str:
     return NumberText(100 * value, ".2f") if math.isfinite(value) else "-"
 
@@ -318,26 +328,26 @@ def _percent(value: float) -> str:
 
 
 def _power(value: float) -> str:
-    return f"{value:.1e}" if math.isfinite(value) else "-"
+    return NumberText(value, ".1e") if math.isfinite(value) else "-"
 
 
 HEIGHT_COLUMNS = (
     "CCDs",
     "number",
     "mean [um]",
-    "rms",
-    "95 %",
-    "peak to valley",
-    "CCD means, rms",
-    "within a CCD, rms",
-    "95 %",
-    "tilt, rms",
-    "shape, rms",
+    "rms [um]",
+    "95 % [um]",
+    "PV [um]",
+    "CCD means [um]",
+    "within a CCD [um]",
+    "within, 95 % [um]",
+    "tilt [um]",
+    "shape [um]",
 )
 HEIGHT_CAPTION = (
-    "Heights along +z, the direction of the light. 95 %: from the 2.5th to the 97.5th percentile, within a CCD the "
-    "median over the CCDs. Tilt and shape: of the best plane of each CCD, and about it. Parts without metrology are "
-    "left out."
+    "Heights along +z, the direction of the light. PV: peak to valley; 95 %: from the 2.5th to the 97.5th percentile, "
+    "within a CCD the median over the CCDs. Rms of the CCDs' means, within CCDs, and of the best plane of each CCD "
+    "(tilt) and about it (shape). Parts without metrology are left out."
 )
 
 
@@ -347,6 +357,6 @@ def height_rows(statistics: dict[str, HeightStatistics]) -> list[tuple[str, ...]
     def row(name: str, of: HeightStatistics) -> tuple[str, ...]:
         heights = (of.mean, of.rms, of.width95, of.peak_to_valley, of.ccd_mean_rms)
         within = (of.within_rms, of.within_width95, of.tilt_rms, of.shape_rms)
-        return name, str(of.n_ccd), *(f"{value * 1e6:.2f}" for value in (*heights, *within))
+        return name, str(of.n_ccd), *(NumberText(value * 1e6, ".2f") for value in (*heights, *within))
 
     return [row(name, of) for name, of in statistics.items()]

@@ -1,20 +1,21 @@
 """Tables of commands as files: numbers with units, errors in columns of their own, names that each format can hold."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from astropy.table import Table
 from astropy.units import Unit
 
-from pachon.commands import measure
 from pachon.commands.tables import Rows, number_texts
-from pachon.pipeline.report.tables import per_ccd
+from pachon.core.number_text import CellText, number_with_error, number_with_unit
 
 ROWS = Rows(
     ("CCD", "ξ+ [µm]", "m1", "", "rms [waves]", "light [%]", ""),
-    [("R22_S11", "1.5", "0.001 ± 0.002", "a", "1", "50.0", "3"), ("Süd", "-", "", "b", "2", "12.5", "4")],
+    [
+        ("R22_S11", "1.5", number_with_error(0.001, 0.002, ".3f"), "a", "1", "50.0", "3"),
+        ("Süd", "-", "", "b", "2", "12.5", "4"),
+    ],
     verdict="Two rows.",
 )
 NUMBERS = {"m1": [0.001, math.nan], "m1_error": [0.002, math.nan]}
@@ -66,19 +67,20 @@ def test_numbers_are_written_in_full_and_shown_rounded(ending, tmp_path, capsys)
     assert [line.split()[1] for line in capsys.readouterr().out.splitlines()[1:]] == ["0.33", "0.00", "-"]
 
 
-def test_tables_of_images_and_ccds_hold_numbers_in_full():
-    figures = {"objects": 4, "stars": 2, "usable": 1, "usable_per_arcmin2": 1.0 / 3.0}
-    measured = SimpleNamespace(metrics={"image": figures}, left_out=())
-    assert measure._image_rows(measured).rows[0][4].value == 1.0 / 3.0
-    keys = (
-        "mean_g_truth",
-        "rms_scatter_g",
-        "rms_residual_g_at_stars",
-        "rms_residual_g_left_out",
-        "rms_residual_g_away",
-    )
-    run = dict.fromkeys(("field_deg", "fwhm_arcsec", *keys, "truth_variance_in_components"), 1.0 / 3.0)
-    run |= {"kink_observed": 1, "kink_truth": 2, "stars_used": 3, "stars": 4}
-    _, field, width, *shapes = per_ccd({"ccd": {"R22_S11": run}})[0]
-    assert (field, width, field.value, width.value) == ("0.33", "0.333", 1.0 / 3.0, 1.0 / 3.0)
-    assert [text.value for text in shapes[: len(keys)]] == [100 * (1.0 / 3.0)] * len(keys)
+def test_cells_of_several_values_are_columns(tmp_path):
+    cells = [
+        (
+            number_with_error(1 / 3, 0.1, ".1f"),
+            number_with_unit(2 / 3, ".2g", "mm"),
+            CellText("3 of 4", {"": 3, "stars": 4}),
+            "1_53",
+        ),
+        ("-", number_with_unit(0.5, ".2g", ""), CellText("1 of 2", {"": 1, "stars": 2}), "1_54"),
+    ]
+    assert cells[0] == ("0.3 ± 0.1", "0.67 mm", "3 of 4", "1_53")
+    Rows(("m1", "size", "used", "CCD"), cells).write(tmp_path / "t.ecsv")
+    table = Table.read(tmp_path / "t.ecsv", format="ascii.ecsv")
+    assert table.colnames == ["m1", "m1_error", "size", "size_unit", "used", "stars", "CCD"]
+    assert [*table[0]] == [1 / 3, 0.1, 2 / 3, "mm", 3, 4, "1_53"]
+    assert np.isnan([table["m1"][1], table["m1_error"][1]]).all()
+    assert table["stars"].dtype.kind == "i"

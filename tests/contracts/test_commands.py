@@ -182,9 +182,11 @@ def test_kinds_of_configurations_name_the_commands_that_take_set():
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_has_no_types_of_python(name, capsys):
+def test_help_at_80_columns_is_not_cut_and_has_no_types_of_python(name, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
     assert main([*name.split(), "--help"]) == 0
     text = capsys.readouterr().out
+    assert "…" not in text
     assert not re.search(r"<[a-z]|\bPATH\b|\[Path\]|\bINTEGER\b|\bFLOAT\b", text)
 
 
