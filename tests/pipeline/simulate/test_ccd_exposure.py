@@ -65,7 +65,7 @@ def test_an_error_names_its_ccd_after_the_ccds_before_it(experiment, stars):
     with pytest.raises(DomainError, match=f"CCD {NAMES[1]}"):
         ccd_loop.simulate_ccds(
             experiment,
-            lambda exposure: modelled.append(exposure.name),
+            lambda exposures: [modelled.append(exposure.name) for exposure in exposures],
             NAMES,
             fields={NAMES[0]: stars[NAMES[0]], NAMES[1]: dark},
             threads=1,
