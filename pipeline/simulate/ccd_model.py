@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.errors import PachonError, attempt
+from ...core.statistics import FWHM_PER_RMS
 from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
 from ...measure.shapes import Shapes, fwhm, measure_shapes
 from ...measure.star_selection import require_stars
@@ -48,11 +49,12 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
 
 
 def model_ccds(
-    experiment: Experiment, exposures: Sequence[CcdExposure], *, noisy: bool = True
+    experiment: Experiment, exposures: Sequence[CcdExposure], *, noisy: bool = True, leave_one_out: bool = True
 ) -> list[CcdProduct | PachonError]:
     """Return the products of CCDs as :func:`model_ccd` does, with the error of a CCD in its place.
 
     No CCD changes a byte of another: together they cost less, as covariances are searched and rays traced at once.
+    Without `leave_one_out` the shapes of models fitted without each star are NaN, and nothing else changes.
     """
     ccds = [attempt(_observed, experiment, exposure, noisy=noisy) for exposure in exposures]
     observed = [ccd for ccd in ccds if not isinstance(ccd, PachonError)]
@@ -65,7 +67,7 @@ def model_ccds(
             continue
         model, sky_axes = next(models), next(jacobians)
         errors = [value for value in (model, sky_axes) if isinstance(value, PachonError)]
-        products.append(errors[0] if errors else attempt(_product, experiment, ccd, model, sky_axes))
+        products.append(errors[0] if errors else attempt(_product, experiment, ccd, model, sky_axes, leave_one_out))
     return products
 
 
@@ -95,7 +97,11 @@ def _jacobians(experiment: Experiment, ccds: Sequence[_ObservedCcd]) -> list[lis
 
 
 def _product(
-    experiment: Experiment, ccd: _ObservedCcd, model: PsfModel, jacobians: Sequence[np.ndarray] | None
+    experiment: Experiment,
+    ccd: _ObservedCcd,
+    model: PsfModel,
+    jacobians: Sequence[np.ndarray] | None,
+    leave_one_out: bool,
 ) -> CcdProduct:
     """Compare the model of one CCD with its stars, and with the noise-free PSFs between them."""
     config, stars, observation = experiment.config, ccd.stars, ccd.observation
@@ -118,13 +124,15 @@ def _product(
         return measure_shapes(images, observed.pixel_scale, experiment.weight_fwhm)
 
     def adaptive_of(images: np.ndarray) -> AdaptiveMoments:
-        return adaptive_moments(images, observed.pixel_scale, threads=1)  # a second CCD is exposed meanwhile
+        # From near the width of stars the iteration takes half the steps. Other CCDs are exposed meanwhile.
+        start = experiment.weight_fwhm / FWHM_PER_RMS
+        return adaptive_moments(images, observed.pixel_scale, start_sigma=start, threads=1)
 
     # Noise-free PSFs are those of flat spectra.
     colours, flat = star_colours(experiment, stars), float(experiment.wavelengths.mean())
     holdout_models = model.at(positions.holdout, colour=flat)
     star_models = model.at(stars.observed, colour=colours)
-    left_out_models = model.leave_one_out()
+    left_out_models = model.leave_one_out() if leave_one_out else np.empty((0, *holdout_images.shape[1:]))
     x, y = experiment.camera.centers[experiment.camera.ccd_index(name)]
     # Like e, g is not that of a star with a defect.
     clean_stars = np.where((observation.defects == 0)[:, None, None], observation.images, np.nan)
@@ -238,11 +246,12 @@ def _adaptive_columns(measured: AdaptiveMoments, model: AdaptiveMoments) -> dict
 
 
 def _leave_one_out_columns(used: np.ndarray, shapes: Shapes, adaptive: AdaptiveMoments) -> dict[str, np.ndarray]:
-    """Return shapes of models fitted without each used star in turn; NaN for the other stars."""
+    """Return shapes of models fitted without each used star in turn; NaN for the other stars, and without shapes."""
     values = {"e1": shapes.e1, "e2": shapes.e2, "g1": adaptive.g1, "g2": adaptive.g2, "sigma": adaptive.sigma}
     columns = {}
     for key, of_used in values.items():
         column = np.full(len(used), np.nan)
-        column[used] = of_used
+        if len(of_used):
+            column[used] = of_used
         columns[f"leave_one_out_{key}"] = column
     return columns

@@ -123,12 +123,15 @@ class VisitWork:
         ellipticities: dict[str, xi.PlaceEllipticities] = {}
 
         def reduce(exposures: Sequence[CcdExposure]) -> list[PachonError | None]:
-            products = model_ccds(experiment, exposures) if self.config.models else [None] * len(exposures)
+            products: Sequence[CcdProduct | PachonError | None] = [None] * len(exposures)
+            if self.config.models:
+                products = model_ccds(experiment, exposures, leave_one_out=self.config.products)
             return [attempt(reduce_ccd, *each) for each in zip(exposures, products, strict=True)]
 
         def reduce_ccd(exposure: CcdExposure, product: CcdProduct | PachonError | None) -> None:
             ccd = experiment.camera.ccd_index(exposure.name)
-            shapes = rows.place_shapes(experiment, exposure.positions.holdout, exposure.holdout)
+            measured = product.holdout if isinstance(product, CcdProduct) else None
+            shapes = rows.place_shapes(experiment, exposure.positions.holdout, exposure.holdout, measured)
             if not np.isfinite(shapes.sigma[0]):
                 raise DomainError("the PSF in its middle has no shape: expected a CCD within the field")
             if isinstance(product, PachonError):
