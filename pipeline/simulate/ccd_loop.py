@@ -18,7 +18,7 @@ from .photometry import PROVISIONAL_FWHM
 from .star_field import StarField
 
 #: Stars of the CCDs that are exposed together, but for a CCD of more: beyond, what a call costs does not count.
-_STARS_TOGETHER = 500
+_STARS_TOGETHER = 1000
 _T = TypeVar("_T")
 
 
