@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..core.errors import PachonError, attempt
+from ..core.errors import PachonError
 from ..core.long_work import claim_folder
 from ..core.products import Card, Stamp, is_whole
 from ..core.version import VERSION
@@ -59,14 +59,18 @@ def write_ccds(experiment: Experiment, folder: Path, exposures: Sequence[CcdExpo
 
     Nothing is written after a product that cannot be.
     """
-    stamp, errors = stamp_of(experiment), []
+    stamp = stamp_of(experiment)
+    errors: list[PachonError | None] = []
     for exposure, product in zip(exposures, model_ccds(experiment, exposures), strict=True):
         if isinstance(product, PachonError):
             errors.append(product)
             continue
-        errors.append(attempt(write_product, folder, product, stamp, ccd_cards(experiment, exposure.name)))
-        if errors[-1] is not None:
+        try:
+            write_product(folder, product, stamp, ccd_cards(experiment, exposure.name))
+        except PachonError as error:
+            errors.append(error)
             break
+        errors.append(None)
     return errors
 
 

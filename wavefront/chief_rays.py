@@ -155,7 +155,9 @@ def _by_axis_scale(
     A group [n] of targets ends when all of it are met.
     """
     corners = JACOBIAN_STEP * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    origin, *ends = _landing_points(telescope, field_direction(*corners.T, "gnomonic"), wavelength, threads)
+    origin, *ends = _landing_points(
+        telescope, field_direction(corners[:, 0], corners[:, 1], "gnomonic"), wavelength, threads
+    )
     jacobian = np.stack([end - origin for end in ends], axis=1) / JACOBIAN_STEP
     if not np.isfinite(jacobian).all() or np.linalg.cond(jacobian) > _MOST_SQUEEZED:
         return None

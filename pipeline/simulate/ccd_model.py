@@ -66,8 +66,12 @@ def model_ccds(
             products.append(ccd)
             continue
         model, sky_axes = next(models), next(jacobians)
-        errors = [value for value in (model, sky_axes) if isinstance(value, PachonError)]
-        products.append(errors[0] if errors else attempt(_product, experiment, ccd, model, sky_axes, leave_one_out))
+        if isinstance(model, PachonError):
+            products.append(model)
+        elif isinstance(sky_axes, PachonError):
+            products.append(sky_axes)
+        else:
+            products.append(attempt(_product, experiment, ccd, model, sky_axes, leave_one_out))
     return products
 
 
