@@ -26,7 +26,7 @@ import numpy as np
 import pachon
 from pachon import Configuration, Experiment
 from pachon.pipeline.config import with_options
-from pachon.pipeline.run_folder import stamp_of, write_ccd
+from pachon.pipeline.run_folder import stamp_of, write_ccds
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
 from pachon.pipeline.simulate.ccd_loop import simulate_ccds
 from pachon.pipeline.simulate.ccd_model import model_ccd
@@ -178,7 +178,7 @@ def check(coefficients, screens, models):
         experiment.make_screens(1)
         middle = time.process_time()
         with tempfile.TemporaryDirectory() as folder:
-            simulate_ccds(experiment, partial(write_ccd, experiment, Path(folder)), threads=1)
+            simulate_ccds(experiment, partial(write_ccds, experiment, Path(folder)), threads=1)
         measured = middle - start, time.process_time() - middle
         for part, mine, real in zip(("screens", "PSFs and models"), predicted, measured, strict=True):
             print(f"check, {name}: {part} predicted {mine:.2f} s, measured {real:.2f} s, ratio {mine / real:.2f}")

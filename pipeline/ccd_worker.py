@@ -13,7 +13,7 @@ from ..core.errors import ProductError
 from ..core.long_work import Execution
 from .experiment import Experiment
 from .memory import check_memory
-from .run_folder import write_ccd
+from .run_folder import write_ccds
 from .screen_cache import with_cached_screens
 from .simulate.ccd_loop import left_out_line, simulate_ccds
 
@@ -31,9 +31,9 @@ def compute_ccds(
     """
     threads, reporter = execution.threads, execution.reporter
     if execution.alone:
-        # One CCD is exposed while the one before is modelled.
+        # Some CCDs are exposed while those before are modelled.
         with experiment.screens(threads, reporter):
-            write = partial(write_ccd, experiment, folder)
+            write = partial(write_ccds, experiment, folder)
             return simulate_ccds(
                 experiment, write, names, strict=strict, threads=threads, reporter=reporter
             ).not_modelled
@@ -60,5 +60,5 @@ def compute_ccd(experiment: Experiment, name: str, threads: int, folder: Path) -
     """Write the product of a CCD as the job of a worker; or return the reason why it cannot be modelled."""
     experiment = with_cached_screens(experiment)
     experiment.make_screens(threads)
-    write = partial(write_ccd, experiment, folder)
+    write = partial(write_ccds, experiment, folder)
     return simulate_ccds(experiment, write, (name,), strict=False, threads=threads).not_modelled.get(name)

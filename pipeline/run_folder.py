@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..core.errors import PachonError
 from ..core.long_work import claim_folder
 from ..core.products import Card, Stamp, is_whole
 from ..core.version import VERSION
@@ -14,7 +15,7 @@ from .config import load_configuration, to_yaml
 from .experiment import Experiment
 from .listed_visit import visit_cards
 from .simulate.ccd_exposure import CcdExposure
-from .simulate.ccd_model import model_ccd
+from .simulate.ccd_model import model_ccds
 
 CONFIG_NAME, SUMMARY_NAME = "config.yaml", "summary.json"
 
@@ -53,9 +54,24 @@ def stamp_of(experiment: Experiment) -> Stamp:
     return Stamp(experiment.config_hash, experiment.config.seed)
 
 
-def write_ccd(experiment: Experiment, folder: Path, exposure: CcdExposure) -> None:
-    """Model one CCD and write its product into the folder of a run."""
-    write_product(folder, model_ccd(experiment, exposure), stamp_of(experiment), ccd_cards(experiment, exposure.name))
+def write_ccds(experiment: Experiment, folder: Path, exposures: Sequence[CcdExposure]) -> list[PachonError | None]:
+    """Model CCDs and write their products into the folder of a run; return the errors of those that have none.
+
+    Nothing is written after a product that cannot be.
+    """
+    stamp = stamp_of(experiment)
+    errors: list[PachonError | None] = []
+    for exposure, product in zip(exposures, model_ccds(experiment, exposures), strict=True):
+        if isinstance(product, PachonError):
+            errors.append(product)
+            continue
+        try:
+            write_product(folder, product, stamp, ccd_cards(experiment, exposure.name))
+        except PachonError as error:
+            errors.append(error)
+            break
+        errors.append(None)
+    return errors
 
 
 def ccd_cards(experiment: Experiment, ccd: str) -> list[Card]:

@@ -23,8 +23,10 @@ from .request import Request
 JACOBIAN_STEP = 1.0e-4
 #: Largest distance of a chief ray from its target on the detector [m].
 _TOLERANCE = 1e-12
-#: Steps of the iteration with the scale on the axis.
+#: Steps of the iteration with the Jacobian on the axis.
 _SCALE_STEPS = 12
+#: Largest ratio of the scales of the image on the axis along two directions with which that iteration is tried.
+_MOST_SQUEEZED = 1e6
 #: Steps of Newton's method after it.
 _NEWTON_STEPS = 20
 
@@ -148,22 +150,31 @@ def fields_of_groups(
 def _by_axis_scale(
     telescope: Telescope, target: np.ndarray, wavelength: float, threads: int | None, group: np.ndarray
 ) -> np.ndarray | None:
-    """Return slopes by iteration with the scales of x and y on the axis; None if it fails (rotated detector).
+    """Return slopes by iteration with the Jacobian on the axis; None if it fails.
 
     A group [n] of targets ends when all of it are met.
     """
-    corners = np.array([0.0, JACOBIAN_STEP])
-    origin, corner = _landing_points(telescope, field_direction(corners, corners, "gnomonic"), wavelength, threads)
-    scale = (corner - origin) / JACOBIAN_STEP
-    if not scale.all():
+    corners = JACOBIAN_STEP * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    origin, *ends = _landing_points(
+        telescope, field_direction(corners[:, 0], corners[:, 1], "gnomonic"), wavelength, threads
+    )
+    jacobian = np.stack([end - origin for end in ends], axis=1) / JACOBIAN_STEP
+    if not np.isfinite(jacobian).all() or np.linalg.cond(jacobian) > _MOST_SQUEEZED:
         return None
-    slopes = (target - origin) / scale
+    (xx, xy), (yx, yy) = np.linalg.inv(jacobian)
+
+    def change_of(miss: np.ndarray) -> np.ndarray:
+        # Written out: the rounding of a product of matrices depends on the number of rows.
+        x, y = miss.T
+        return np.stack([xx * x + xy * y, yx * x + yy * y], axis=1)
+
+    slopes = change_of(target - origin)
     searched = np.arange(len(target))
-    # The scale is within a per cent everywhere, so each step gains two digits or more.
+    # The Jacobian is within a per cent everywhere, so each step gains two digits or more.
     for _ in range(_SCALE_STEPS):
         light = field_direction(slopes[searched, 0], slopes[searched, 1], "gnomonic")
         miss = target[searched] - _landing_points(telescope, light, wavelength, threads)
-        slopes[searched] += miss / scale
+        slopes[searched] += change_of(miss)
         if not np.isfinite(miss).all():
             return None
         missed = group[searched][~(np.abs(miss).max(axis=1, initial=0.0) < _TOLERANCE)]

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-from ...core.errors import DomainError, PachonError, ProductError, attempt
+from ...core.errors import DomainError, PachonError, ProductError
 from ...core.progress import Reporter
 from ...core.threads import thread_count
 from ..experiment import Experiment
@@ -18,18 +18,8 @@ from .photometry import PROVISIONAL_FWHM
 from .star_field import StarField
 
 #: Stars of the CCDs that are exposed together, but for a CCD of more: beyond, what a call costs does not count.
-_STARS_TOGETHER = 500
+_STARS_TOGETHER = 1000
 _T = TypeVar("_T")
-
-
-@dataclass(frozen=True)
-class ModelTogether(Generic[_T]):
-    """A reduction of the CCDs that are exposed together, for :func:`simulate_ccds`.
-
-    It returns their results in order, with the error of a CCD in its place; none may depend on the other CCDs.
-    """
-
-    reduce: Callable[[Sequence[CcdExposure]], Sequence[_T | PachonError]]
 
 
 @dataclass(frozen=True)
@@ -42,7 +32,7 @@ class SimulatedCcds(Generic[_T]):
 
 def simulate_ccds(
     experiment: Experiment,
-    model: Callable[[CcdExposure], _T] | ModelTogether[_T],
+    model: Callable[[Sequence[CcdExposure]], Sequence[_T | PachonError]],
     names: Sequence[str] | None = None,
     *,
     fields: Mapping[str, StarField] | None = None,
@@ -54,11 +44,12 @@ def simulate_ccds(
 ) -> SimulatedCcds[_T]:
     """Expose CCDs, a few at a time, and model them beside the next exposures.
 
-    `model` is any reduction of an exposure, such as :func:`~.model_ccd`, or of those of a few CCDs. It runs on a thread
-    of its own, once at a time, in the order of the CCDs; no byte depends on the number of threads. `names` are by
-    default those of the configuration, `fields` are the stars of each CCD, by default drawn over it, and `title` is
-    that of the progress bar. With `centered` exposures hold the observed stars centred on a pixel as well. A CCD that
-    cannot be modelled ends the loop with `strict`, after the models under way; otherwise it is reported and left out.
+    `model` is any reduction of the exposures of a few CCDs, such as :func:`~.model_ccds`: it returns their results in
+    order, with the error of a CCD in its place, and none may depend on the other CCDs. It runs on a thread of its own,
+    once at a time, in the order of the CCDs; no byte depends on the number of threads. `names` are by default those of
+    the configuration, `fields` are the stars of each CCD, by default drawn over it, and `title` is that of the progress
+    bar. With `centered` exposures hold the observed stars centred on a pixel as well. A CCD that cannot be modelled
+    ends the loop with `strict`, after the models under way; otherwise it is reported and left out.
 
     Raises
     ------
@@ -87,10 +78,7 @@ def simulate_ccds(
 
         def submit(exposures: Sequence[CcdExposure]) -> None:
             ccds = [exposure.name for exposure in exposures]
-            if isinstance(model, ModelTogether):
-                pending.append((ccds, modeller.submit(model.reduce, exposures)))
-            else:
-                pending.append((ccds, modeller.submit(_one_by_one, model, exposures)))
+            pending.append((ccds, modeller.submit(model, exposures)))
 
         def collect() -> None:
             for ccds, future in pending:
@@ -117,16 +105,6 @@ def simulate_ccds(
                 stage.step(exposure.name, exposed_ccds, len(names))
         collect()
     return simulated
-
-
-def _one_by_one(model: Callable[[CcdExposure], _T], exposures: Sequence[CcdExposure]) -> list[_T | PachonError]:
-    """Return results of CCDs, with the error of a CCD in its place; nothing after a product that cannot be written."""
-    results: list[_T | PachonError] = []
-    for exposure in exposures:
-        results.append(attempt(model, exposure))
-        if isinstance(results[-1], ProductError):
-            break
-    return results
 
 
 def _groups(

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from ...core.errors import PachonError
+from ...core.errors import PachonError, attempt
+from ...core.statistics import FWHM_PER_RMS
 from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
 from ...measure.shapes import Shapes, fwhm, measure_shapes
 from ...measure.star_selection import require_stars
@@ -14,17 +16,25 @@ from ...models.star_spectrum import blackbody_photons, effective_colour
 from ...reconstruction.ccd_product import CcdProduct, HoldoutStars, ObservedStars
 from ...reconstruction.psf_model.fit import CcdStars, fit_stars
 from ...reconstruction.psf_model.model import CLIPPING, PsfModel
-from ...sky.sky_shapes import along_sky, jacobians_on_sky
-from ...wavefront.chief_rays import fields_at
+from ...sky.sky_shapes import along_sky
 from ..experiment import Experiment
 from ..resolved_values import least_star_count, noise_free_components
 from .ccd_exposure import CcdExposure, ccd_stars
 from .ccd_observation import Observation, collected_images, observe_ccd
 from .photometry import effective_fwhm, signal_to_noise
+from .sky_axes import sky_jacobians
 from .star_field import StarField
 
-#: Step on the detector of the central differences for the axes of the sky [m]: 2 arcsec of the LSST.
-_SKY_STEP = 1e-4
+
+class _ObservedCcd(NamedTuple):
+    """Stars of one CCD before they are modelled."""
+
+    exposure: CcdExposure
+    stars: StarField  #: with magnitudes of the limit that vignetting leaves
+    electrons: np.ndarray
+    snr: np.ndarray
+    observation: Observation
+    model_stars: CcdStars  #: those that the model is fitted to
 
 
 def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = True) -> CcdProduct:
@@ -32,21 +42,78 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
 
     Without noise no pixel is rejected: deviations from the mean are the variation of the PSF.
     """
-    config = experiment.config
-    name, positions, holdout, observed = exposure.name, exposure.positions, exposure.holdout, exposure.observed
-    holdout_images = holdout.image.astype(np.float64)
-    holdout_shapes = measure_shapes(holdout_images, holdout.pixel_scale, experiment.weight_fwhm)
+    product = model_ccds(experiment, [exposure], noisy=noisy)[0]
+    if isinstance(product, PachonError):
+        raise product
+    return product
+
+
+def model_ccds(
+    experiment: Experiment, exposures: Sequence[CcdExposure], *, noisy: bool = True, leave_one_out: bool = True
+) -> list[CcdProduct | PachonError]:
+    """Return the products of CCDs as :func:`model_ccd` does, with the error of a CCD in its place.
+
+    No CCD changes a byte of another: together they cost less, as covariances are searched and rays traced at once.
+    Without `leave_one_out` the shapes of models fitted without each star are NaN, and nothing else changes.
+    """
+    ccds = [attempt(_observed, experiment, exposure, noisy=noisy) for exposure in exposures]
+    observed = [ccd for ccd in ccds if not isinstance(ccd, PachonError)]
+    models = iter(fit_ccd_models(experiment, [ccd.model_stars for ccd in observed], noisy=noisy))
+    jacobians = iter(_jacobians(experiment, observed))
+    products: list[CcdProduct | PachonError] = []
+    for ccd in ccds:
+        if isinstance(ccd, PachonError):
+            products.append(ccd)
+            continue
+        model, sky_axes = next(models), next(jacobians)
+        if isinstance(model, PachonError):
+            products.append(model)
+        elif isinstance(sky_axes, PachonError):
+            products.append(sky_axes)
+        else:
+            products.append(attempt(_product, experiment, ccd, model, sky_axes, leave_one_out))
+    return products
+
+
+def _observed(experiment: Experiment, exposure: CcdExposure, *, noisy: bool) -> _ObservedCcd:
+    """Add noise and defects to the stars of one CCD where `noisy`; DomainError if too few are left for a model."""
+    holdout, observed = exposure.holdout, exposure.observed
     # Positions do not depend on the magnitude limits, which follow from the vignetting of the stars.
     width = effective_fwhm(holdout.image, holdout.pixel_scale)
-    stars = ccd_stars(experiment, name, width, least_light=float(observed.lit_fraction.min()))
+    stars = ccd_stars(experiment, exposure.name, width, least_light=float(observed.lit_fraction.min()))
     electrons = stars.electrons * observed.lit_fraction
-    snr = signal_to_noise(
-        stars.magnitude - 2.5 * np.log10(observed.lit_fraction), stars.band, config.atmosphere.exposure_s, width
-    )
+    dimmed = stars.magnitude - 2.5 * np.log10(observed.lit_fraction)
+    snr = signal_to_noise(dimmed, stars.band, experiment.config.atmosphere.exposure_s, width)
     collected = collected_images(experiment, observed.image, observed.pixel_scale, electrons)
-    observation = observe_ccd(experiment, name, collected, observed.pixel_scale, electrons, noisy=noisy)
+    observation = observe_ccd(experiment, exposure.name, collected, observed.pixel_scale, electrons, noisy=noisy)
+    return _ObservedCcd(exposure, stars, electrons, snr, observation, model_stars(experiment, observation, stars, snr))
+
+
+def _jacobians(experiment: Experiment, ccds: Sequence[_ObservedCcd]) -> list[list[np.ndarray] | PachonError | None]:
+    """Return d(sky)/d(x, y) at the holdout positions and stars of each CCD, or its error; None without a pointing."""
+    if experiment.pointing is None:
+        return [None] * len(ccds)
+    groups = [[ccd.exposure.positions.holdout, ccd.stars.observed] for ccd in ccds]
+    together = attempt(sky_jacobians, experiment, [positions for group in groups for positions in group])
+    if isinstance(together, PachonError):  # of one CCD
+        return [attempt(sky_jacobians, experiment, group) for group in groups]
+    return [together[i : i + 2] for i in range(0, len(together), 2)]
+
+
+def _product(
+    experiment: Experiment,
+    ccd: _ObservedCcd,
+    model: PsfModel,
+    jacobians: Sequence[np.ndarray] | None,
+    leave_one_out: bool,
+) -> CcdProduct:
+    """Compare the model of one CCD with its stars, and with the noise-free PSFs between them."""
+    config, stars, observation = experiment.config, ccd.stars, ccd.observation
+    name, positions = ccd.exposure.name, ccd.exposure.positions
+    holdout, observed = ccd.exposure.holdout, ccd.exposure.observed
     used = observation.used
-    model = fit_ccd_model(experiment, observation, stars, snr, noisy=noisy)
+    holdout_images = holdout.image.astype(np.float64)
+    holdout_shapes = measure_shapes(holdout_images, holdout.pixel_scale, experiment.weight_fwhm)
     # Noise-free stars have no outliers: deviations from the mean are the variation of the PSF.
     noise_free_model = PsfModel.fit(
         holdout_images,
@@ -61,17 +128,20 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         return measure_shapes(images, observed.pixel_scale, experiment.weight_fwhm)
 
     def adaptive_of(images: np.ndarray) -> AdaptiveMoments:
-        return adaptive_moments(images, observed.pixel_scale, threads=1)  # a second CCD is exposed meanwhile
+        # From near the width of stars the iteration takes half the steps. Other CCDs are exposed meanwhile.
+        start = experiment.weight_fwhm / FWHM_PER_RMS
+        return adaptive_moments(images, observed.pixel_scale, start_sigma=start, threads=1)
 
     # Noise-free PSFs are those of flat spectra.
     colours, flat = star_colours(experiment, stars), float(experiment.wavelengths.mean())
     holdout_models = model.at(positions.holdout, colour=flat)
     star_models = model.at(stars.observed, colour=colours)
-    left_out_models = model.leave_one_out()
+    left_out_models = model.leave_one_out() if leave_one_out else np.empty((0, *holdout_images.shape[1:]))
     x, y = experiment.camera.centers[experiment.camera.ccd_index(name)]
     # Like e, g is not that of a star with a defect.
     clean_stars = np.where((observation.defects == 0)[:, None, None], observation.images, np.nan)
     holdout_moments, star_moments = adaptive_of(holdout_images), adaptive_of(clean_stars)
+    holdout_axes, star_axes = (None, None) if jacobians is None else jacobians
     return CcdProduct(
         name=name,
         center=(float(x), float(y)),
@@ -81,18 +151,18 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
             **_position_columns(experiment, positions.holdout, holdout.fields),
             **_shape_columns(holdout_shapes, shapes_of(holdout_models)),
             **_adaptive_columns(holdout_moments, adaptive_of(holdout_models)),
-            **_sky_columns(experiment, positions.holdout, holdout_shapes, holdout_moments),
+            **_sky_columns(holdout_axes, holdout_shapes, holdout_moments),
             fwhm=fwhm(holdout.image, holdout.pixel_scale),
         ),
         observed=ObservedStars(
             **_position_columns(experiment, stars.observed, observed.fields),
             **_shape_columns(observation.shapes, shapes_of(star_models)),
             **_adaptive_columns(star_moments, adaptive_of(star_models)),
-            **_sky_columns(experiment, stars.observed, observation.shapes, star_moments),
+            **_sky_columns(star_axes, observation.shapes, star_moments),
             **_leave_one_out_columns(used, shapes_of(left_out_models), adaptive_of(left_out_models)),
             magnitude=stars.magnitude,
-            electrons=electrons,
-            snr=snr,
+            electrons=ccd.electrons,
+            snr=ccd.snr,
             defects=observation.defects,
             used=used,
             colour=colours,
@@ -103,16 +173,6 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         noise_free_model=noise_free_model,
         rotator=experiment.rotator,
     )
-
-
-def fit_ccd_model(
-    experiment: Experiment, observation: Observation, stars: StarField, snr: np.ndarray, *, noisy: bool = True
-) -> PsfModel:
-    """Fit the PSF model of the configuration to the observed stars of one CCD, S/N [n], that can be used."""
-    model = fit_ccd_models(experiment, [model_stars(experiment, observation, stars, snr)], noisy=noisy)[0]
-    if isinstance(model, PachonError):
-        raise model
-    return model
 
 
 def model_stars(experiment: Experiment, observation: Observation, stars: StarField, snr: np.ndarray) -> CcdStars:
@@ -156,19 +216,10 @@ def _position_columns(experiment: Experiment, positions: np.ndarray, fields: np.
     return columns
 
 
-def _sky_columns(
-    experiment: Experiment, positions: np.ndarray, shapes: Shapes, adaptive: AdaptiveMoments
-) -> dict[str, np.ndarray]:
-    """Return ellipticities along the axes of the sky at positions on the detector [m]; none without a pointing."""
-    aim, wavelengths = experiment.pointing, experiment.wavelengths
-    if aim is None:
+def _sky_columns(jacobians: np.ndarray | None, shapes: Shapes, adaptive: AdaptiveMoments) -> dict[str, np.ndarray]:
+    """Return ellipticities along the axes of the sky, to which Jacobians [n, 2, 2] lead; none without them."""
+    if jacobians is None:
         return {}
-
-    def celestial_of(places: np.ndarray) -> np.ndarray:
-        fields = fields_at(experiment.telescope, places, wavelengths[len(wavelengths) // 2], threads=1)
-        return aim.to_celestial(aim.to_sky(np.tan(fields)))
-
-    _, jacobians = jacobians_on_sky(celestial_of, positions, _SKY_STEP)
     e1, e2 = along_sky(shapes.e1, shapes.e2, jacobians)
     g1, g2 = along_sky(adaptive.g1, adaptive.g2, jacobians)
     return {"e1_sky": e1, "e2_sky": e2, "g1_sky": g1, "g2_sky": g2}
@@ -199,11 +250,12 @@ def _adaptive_columns(measured: AdaptiveMoments, model: AdaptiveMoments) -> dict
 
 
 def _leave_one_out_columns(used: np.ndarray, shapes: Shapes, adaptive: AdaptiveMoments) -> dict[str, np.ndarray]:
-    """Return shapes of models fitted without each used star in turn; NaN for the other stars."""
+    """Return shapes of models fitted without each used star in turn; NaN for the other stars, and without shapes."""
     values = {"e1": shapes.e1, "e2": shapes.e2, "g1": adaptive.g1, "g2": adaptive.g2, "sigma": adaptive.sigma}
     columns = {}
     for key, of_used in values.items():
         column = np.full(len(used), np.nan)
-        column[used] = of_used
+        if len(of_used):
+            column[used] = of_used
         columns[f"leave_one_out_{key}"] = column
     return columns

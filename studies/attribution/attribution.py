@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...core.errors import DomainError
+from ...core.errors import DomainError, PachonError
 from ...core.progress import Reporter
 from ...core.statistics import rms
 from ...core.units import ARCSEC
@@ -31,7 +31,7 @@ from ...pipeline.focal_plane_stage import apply_focal_plane_model
 from ...pipeline.memory import check_memory
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds
-from ...pipeline.simulate.ccd_model import model_ccd
+from ...pipeline.simulate.ccd_model import model_ccds
 from ...pipeline.summary import correlations, ellipticities, has_focal_plane_model, size_residuals
 from ...reconstruction.ccd_product import CCD_KINDS, MOMENTS, CcdProduct, CcdStars
 from .causes import FULL, NOISE, OPTICS, checked_causes, without
@@ -127,10 +127,18 @@ def _stars_by_case(
     kinds = {case: True, NOISE: False} if noiseless else {case: True}
     focal_plane_model = experiment.config.reconstruction.model == "focal_plane"
 
-    def model(exposure: CcdExposure) -> list[CcdStars]:
-        products = [model_ccd(experiment, exposure, noisy=noisy) for noisy in kinds.values()]
+    def stars_of(product: CcdProduct) -> CcdStars:
         # A focal-plane model takes the noise of the stars from their stamps.
-        return [replace(p, holdout_images=p.holdout_images[:0]) if focal_plane_model else p.ccd_stars for p in products]
+        return replace(product, holdout_images=product.holdout_images[:0]) if focal_plane_model else product.ccd_stars
+
+    def model(exposures: Sequence[CcdExposure]) -> list[list[CcdStars] | PachonError]:
+        products_by_kind = [model_ccds(experiment, exposures, noisy=noisy) for noisy in kinds.values()]
+        results: list[list[CcdStars] | PachonError] = []
+        for of_ccd in zip(*products_by_kind, strict=True):
+            errors = [product for product in of_ccd if isinstance(product, PachonError)]
+            products = [product for product in of_ccd if not isinstance(product, PachonError)]
+            results.append(errors[0] if errors else [stars_of(product) for product in products])
+        return results
 
     title = "everything on" if case == FULL else f"{case} off"
     simulated = simulate_ccds(experiment, model, title=title, strict=False, threads=threads, reporter=reporter)

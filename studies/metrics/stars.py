@@ -18,7 +18,7 @@ from ...measure.correlation import SEPARATION_RANGES
 from ...measure.shapes import fwhm
 from ...pipeline.focal_plane_stage import apply_focal_plane_model
 from ...pipeline.simulate.ccd_loop import simulate_ccds
-from ...pipeline.simulate.ccd_model import model_ccd
+from ...pipeline.simulate.ccd_model import model_ccds
 from ...pipeline.simulate.photometry import effective_fwhm
 from ...pipeline.summary import correlations, run_metrics
 from ...reconstruction.ccd_product import MOMENTS
@@ -215,7 +215,7 @@ def correlation_bins(scene: Scene) -> dict[str, float]:
 def reconstruction(scene: Scene) -> dict[str, float]:
     """Return the residuals of PSF models of noisy stars, and their correlations."""
     experiment = scene.camera_experiment
-    simulated = simulate_ccds(experiment, partial(model_ccd, experiment), threads=scene.threads)
+    simulated = simulate_ccds(experiment, partial(model_ccds, experiment), threads=scene.threads)
     products = list(simulated.results.values())
     if experiment.config.reconstruction.model == "focal_plane":
         products, _ = apply_focal_plane_model(experiment, products, threads=scene.threads)

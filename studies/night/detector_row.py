@@ -20,7 +20,7 @@ from ...models.camera.photometry import BANDS
 from ...pipeline.experiment import Experiment
 from ...pipeline.simulate.ccd_exposure import NoiseFreeStars
 from ...pipeline.simulate.photometry import instrument_noise, sky_electrons_per_pixel
-from ...reconstruction.ccd_product import CcdProduct
+from ...reconstruction.ccd_product import CcdProduct, HoldoutStars
 
 #: Columns in order: unit in FITS notation, description.
 COLUMNS = {
@@ -77,14 +77,16 @@ class PlaceShapes(NamedTuple):
     area: np.ndarray  #: effective area [CCD pixel^2]
 
 
-def place_shapes(experiment: Experiment, xy: np.ndarray, stars: NoiseFreeStars) -> PlaceShapes:
-    """Measure noise-free PSFs at places on the focal plane [m]."""
+def place_shapes(
+    experiment: Experiment, xy: np.ndarray, stars: NoiseFreeStars, measured: HoldoutStars | None = None
+) -> PlaceShapes:
+    """Measure noise-free PSFs at places on the focal plane [m], if they are not `measured` already."""
     # Stamps may have finer pixels than the CCDs.
     ratio = experiment.pixel_size / experiment.camera.pixel_size
-    moments = adaptive_moments(stars.image.astype(np.float64), 1.0, threads=1)
+    moments = measured or adaptive_moments(stars.image.astype(np.float64), stars.pixel_scale, threads=1)
     total = stars.image.sum(axis=(1, 2), dtype=np.float64)
     area = total**2 / (stars.image.astype(np.float64) ** 2).sum(axis=(1, 2))
-    return PlaceShapes(xy, moments.sigma * ratio, moments.g1, moments.g2, area * ratio**2)
+    return PlaceShapes(xy, moments.sigma * (ratio / stars.pixel_scale), moments.g1, moments.g2, area * ratio**2)
 
 
 def moments_along_pixels(

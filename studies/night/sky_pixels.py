@@ -9,16 +9,15 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.errors import ConfigError
+from ...models.camera.camera import Camera
 from ...pipeline.experiment import Experiment
 from ...pipeline.photometry import pixel_angle
 from ...pipeline.resolved_values import resolved_value
 from ...raytrace.rays import field_direction
-from ...sky.sky_shapes import along_sky, jacobians_on_sky
-from ...wavefront.chief_rays import chief_rays, fields_at
+from ...sky.sky_shapes import along_sky
+from ...wavefront.chief_rays import chief_rays
 from .detector_row import PlaceShapes
 
-#: Step on the detector of the central differences for the axes of the sky [m]: 2 arcsec of the LSST.
-_SKY_STEP = 1e-4
 #: Room about the outermost corner of a CCD, for distortion.
 _MARGIN = 1.05
 
@@ -64,28 +63,16 @@ def covered_pixels(experiment: Experiment, nside: int) -> SkyPixels:
     return SkyPixels(index[rows], ccd[rows], xy[rows])
 
 
-def shapes_on_sky(experiment: Experiment, places: PlaceShapes) -> tuple[np.ndarray, np.ndarray]:
-    """Return g of the PSFs at places along the axes of the sky, > 0 from east to west and north-west to south-east."""
-    pointing, wavelengths = resolved_value(experiment.pointing), experiment.wavelengths
-
-    def celestial_of(xy: np.ndarray) -> np.ndarray:
-        fields = fields_at(experiment.telescope, xy, wavelengths[len(wavelengths) // 2], threads=1)
-        return pointing.to_celestial(pointing.to_sky(np.tan(fields)))
-
-    _, jacobians = jacobians_on_sky(celestial_of, places.xy, _SKY_STEP)
-    return along_sky(places.g1, places.g2, jacobians)
-
-
-def interpolated(experiment: Experiment, ccd: int, places: PlaceShapes, xy: np.ndarray) -> np.ndarray:
+def interpolated(camera: Camera, ccd: int, places: PlaceShapes, jacobians: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """Return sigma, g1 and g2 on the sky and area at points of a CCD [m], shape [n, 4].
 
-    They are those of a polynomial over the CCD, of the second order where there are at least twelve places, of the
-    first where there are six, else of the mean.
+    `jacobians` are d(west, north)/d(x, y) at the places, [m, 2, 2]: g1 > 0 from east to west, g2 > 0 from north-west to
+    south-east. Values are those of a polynomial over the CCD, of the second order where there are at least twelve
+    places, of the first where there are six, else of the mean.
     """
-    values = np.stack([places.sigma, *shapes_on_sky(experiment, places), places.area], axis=1)
+    values = np.stack([places.sigma, *along_sky(places.g1, places.g2, jacobians), places.area], axis=1)
     good = np.isfinite(values).all(axis=1)
     order = 2 if good.sum() >= 12 else 1 if good.sum() >= 6 else 0
-    camera = experiment.camera
     design, points = (_monomials(camera.to_uv(ccd, at), order) for at in (places.xy[good], xy))
     return np.asarray(points @ np.linalg.lstsq(design, values[good], rcond=None)[0])
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from ...core.errors import DomainError, PachonError, ProductError
+from ...core.errors import DomainError, PachonError, ProductError, attempt
 from ...core.products import Columns, Stamp, column, read_fits, table_hdu, write_fits
 from ...core.progress import Reporter
 from ...pipeline.experiment import Experiment
@@ -18,10 +19,11 @@ from ...pipeline.resolved_values import resolved_value
 from ...pipeline.run_folder import ccd_cards
 from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_stars
 from ...pipeline.simulate.ccd_loop import simulate_ccds
-from ...pipeline.simulate.ccd_model import model_ccd
+from ...pipeline.simulate.ccd_model import model_ccds
 from ...pipeline.simulate.photometry import PROVISIONAL_FWHM
+from ...pipeline.simulate.sky_axes import sky_jacobians
 from ...pipeline.simulate.star_field import StarField
-from ...reconstruction.ccd_product import write_product
+from ...reconstruction.ccd_product import CcdProduct, write_product
 from ...sky.visit_list.visit_list import ListedVisit
 from . import detector_row as rows
 from . import residual_correlation as xi
@@ -120,12 +122,20 @@ class VisitWork:
         places: dict[int, rows.PlaceShapes] = {}
         ellipticities: dict[str, xi.PlaceEllipticities] = {}
 
-        def reduced(exposure: CcdExposure) -> None:
+        def reduce(exposures: Sequence[CcdExposure]) -> list[PachonError | None]:
+            products: Sequence[CcdProduct | PachonError | None] = [None] * len(exposures)
+            if self.config.models:
+                products = model_ccds(experiment, exposures, leave_one_out=self.config.products)
+            return [attempt(reduce_ccd, *each) for each in zip(exposures, products, strict=True)]
+
+        def reduce_ccd(exposure: CcdExposure, product: CcdProduct | PachonError | None) -> None:
             ccd = experiment.camera.ccd_index(exposure.name)
-            shapes = rows.place_shapes(experiment, exposure.positions.holdout, exposure.holdout)
+            measured = product.holdout if isinstance(product, CcdProduct) else None
+            shapes = rows.place_shapes(experiment, exposure.positions.holdout, exposure.holdout, measured)
             if not np.isfinite(shapes.sigma[0]):
                 raise DomainError("the PSF in its middle has no shape: expected a CCD within the field")
-            product = model_ccd(experiment, exposure) if self.config.models else None
+            if isinstance(product, PachonError):
+                raise product
             if product is not None and self.config.products:
                 cards = ccd_cards(experiment, exposure.name)
                 write_product(folder, product, self.stamp, cards, f"visit_{visit.visit}_")
@@ -140,7 +150,7 @@ class VisitWork:
         with experiment.screens(threads, reporter):
             simulated = simulate_ccds(
                 experiment,
-                reduced,
+                reduce,
                 names,
                 fields={name: _fields(experiment, name, self.config.models) for name in names},
                 title=f"{visit.label}, {visit.band}: {len(names)} CCDs",
@@ -225,8 +235,9 @@ def _pixels(experiment: Experiment, places: dict[int, rows.PlaceShapes], nside: 
     mask = np.isin(covered.ccd, list(places))
     index, ccd, xy = (values[mask] for values in covered)
     values = np.zeros((len(index), 4))
-    for number, shapes in places.items():
+    jacobians = sky_jacobians(experiment, [shapes.xy for shapes in places.values()])
+    for (number, shapes), sky_axes in zip(places.items(), jacobians, strict=True):
         on_ccd = ccd == number
         if on_ccd.any():
-            values[on_ccd] = interpolated(experiment, number, shapes, xy[on_ccd])
+            values[on_ccd] = interpolated(experiment.camera, number, shapes, sky_axes, xy[on_ccd])
     return dict(zip(PIXEL_COLUMNS, (index, ccd.astype(np.int64), *values.T), strict=True))

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ...core.errors import attempt
 from ...core.progress import Reporter
 from ...core.random_streams import stream
 from ...core.statistics import finite_mean
@@ -72,7 +73,13 @@ def simulate(experiment: Experiment, threads: int | None, reporter: Reporter) ->
         return SimulatedCcd(exposure, holdout, _centered_and_measured(experiment, exposure, exposure.observed.image))
 
     with experiment.screens(threads, reporter):
-        simulated = simulate_ccds(experiment, measured, title="stars", threads=threads, reporter=reporter)
+        simulated = simulate_ccds(
+            experiment,
+            lambda exposures: [attempt(measured, exposure) for exposure in exposures],
+            title="stars",
+            threads=threads,
+            reporter=reporter,
+        )
     return list(simulated.results.values())
 
 

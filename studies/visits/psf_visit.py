@@ -18,7 +18,7 @@ from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_stage import fit_focal_plane_model
 from ...pipeline.resolved_values import resolved_value
 from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_outline
-from ...pipeline.simulate.ccd_loop import ModelTogether, simulate_ccds
+from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import fit_ccd_models, model_stars
 from ...pipeline.simulate.ccd_observation import Observation, collected_images, observe_ccd
 from ...pipeline.simulate.photometry import (
@@ -195,7 +195,7 @@ def visit_psfs(
     with experiment.screens(threads, reporter):
         simulated = simulate_ccds(
             experiment,
-            ModelTogether(modelled),
+            modelled,
             list(fields),
             fields=fields,
             centered=True,

@@ -215,17 +215,17 @@ def test_ccds_computed_apart_make_the_run_of_one_machine(focal_plane_config, tmp
 
 @pytest.mark.slow
 def test_a_ccd_that_cannot_be_modelled_is_left_out(focal_plane_config, tmp_path, plane_model, no_report, monkeypatch):
-    real, config = run_folder.model_ccd, focal_plane_config(stars__observed=32)
+    real, config = run_folder.model_ccds, focal_plane_config(stars__observed=32)
 
-    def fails(experiment, exposure):
-        if exposure.name == CCDS[0]:
-            raise DomainError("too few stars")
-        return real(experiment, exposure)
+    def fails(experiment, exposures):
+        products = real(experiment, exposures)
+        error = DomainError("too few stars")
+        return [error if e.name == CCDS[0] else p for e, p in zip(exposures, products, strict=True)]
 
-    monkeypatch.setattr(run_folder, "model_ccd", fails)
+    monkeypatch.setattr(run_folder, "model_ccds", fails)
     result = run(config, tmp_path / "out")
     assert result.not_modelled == {CCDS[0]: "too few stars"}
-    monkeypatch.setattr(run_folder, "model_ccd", real)
+    monkeypatch.setattr(run_folder, "model_ccds", real)
     run(focal_plane_config(stars__observed=32, ccds=CCDS[1:]), tmp_path / "alone")
     name = f"ccd_{CCDS[1]}.fits"
     assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()

@@ -20,7 +20,7 @@ from pachon.pipeline.config import load_configuration, with_options
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.run import run
 from pachon.pipeline.simulate import ccd_exposure, ccd_loop
-from pachon.pipeline.simulate.ccd_model import model_ccd
+from pachon.pipeline.simulate.ccd_model import model_ccd, model_ccds
 from pachon.pipeline.simulate.photometry import electrons
 from pachon.pipeline.summary import separation_bins
 from pachon.reconstruction.ccd_product import read_product
@@ -178,14 +178,14 @@ def test_an_error_inside_a_ccd_names_it(tmp_path, monkeypatch, tiny, no_report):
 @pytest.fixture
 def failing_ccd(monkeypatch):
     """Let the first CCD be one that cannot be modelled."""
-    real = run_folder.model_ccd
+    real = run_folder.model_ccds
 
-    def fails(experiment, exposure):
-        if exposure.name == "R22_S11":
-            raise DomainError("3 of 12 stars left (9 neighbour): expected at least 5")
-        return real(experiment, exposure)
+    def fails(experiment, exposures):
+        error = DomainError("3 of 12 stars left (9 neighbour): expected at least 5")
+        products = real(experiment, exposures)
+        return [error if e.name == "R22_S11" else p for e, p in zip(exposures, products, strict=True)]
 
-    monkeypatch.setattr(run_folder, "model_ccd", fails)
+    monkeypatch.setattr(run_folder, "model_ccds", fails)
     return "3 of 12 stars left (9 neighbour): expected at least 5"
 
 
@@ -214,7 +214,7 @@ def test_a_ccd_that_could_not_be_modelled_is_tried_again(
     finished_run, tmp_path, tiny, no_report, failing_ccd, monkeypatch
 ):
     run(tiny(), tmp_path / "out", execution=Execution(threads=1))
-    monkeypatch.setattr(run_folder, "model_ccd", model_ccd)
+    monkeypatch.setattr(run_folder, "model_ccds", model_ccds)
     result = run(tiny(), tmp_path / "out", execution=Execution(resume=True))
     assert (result.kept, result.computed, result.not_modelled) == (("R24_S12",), ("R22_S11",), {})
     assert contents(tmp_path / "out") == contents(finished_run)

@@ -80,14 +80,13 @@ def test_a_part_is_two_numbers(tmp_path, capsys, text):
 
 
 def test_a_ccd_that_cannot_be_modelled_is_left_out_or_ends_the_run(tmp_path, tiny, monkeypatch):
-    real = run_folder.model_ccd
+    real = run_folder.model_ccds
 
-    def fails(experiment, exposure):
-        if exposure.name == "R22_S11":
-            raise DomainError("3 of 12 stars left")
-        return real(experiment, exposure)
+    def fails(experiment, exposures):
+        (exposure,) = exposures
+        return [DomainError("3 of 12 stars left")] if exposure.name == "R22_S11" else real(experiment, exposures)
 
-    monkeypatch.setattr(run_folder, "model_ccd", fails)
+    monkeypatch.setattr(run_folder, "model_ccds", fails)
     result = run(tiny(), tmp_path / "one", execution=Execution(workers=serial_worker))
     assert (result.not_modelled, result.computed) == ({"R22_S11": "3 of 12 stars left"}, ("R24_S12",))
     with pytest.raises(ProductError, match=r"^CCD R22_S11: 3 of 12 stars left$"):

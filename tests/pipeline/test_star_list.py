@@ -16,7 +16,7 @@ from pachon.pipeline.config import Configuration, load_configuration, to_yaml, w
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.report.diagnostics import diagnose
 from pachon.pipeline.run import run
-from pachon.pipeline.run_folder import write_ccd
+from pachon.pipeline.run_folder import write_ccds
 from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_ccd, expose_positions
 from pachon.pipeline.simulate.ccd_loop import simulate_ccds
 from pachon.pipeline.star_list import RIM, place_stars
@@ -329,9 +329,9 @@ def test_a_run_without_enough_stars_ends_before_it_begins(tmp_path, config):
     with pytest.raises(PachonError, match=reason):
         run(config, tmp_path / "strict", strict=True)
     with pytest.raises(PachonError, match=reason):
-        simulate_ccds(experiment, write_ccd)
+        simulate_ccds(experiment, write_ccds)
     # A worker has one CCD at a time, and reports it.
-    assert list(simulate_ccds(experiment, write_ccd, strict=False).not_modelled) == ["R41_S20"]
+    assert list(simulate_ccds(experiment, write_ccds, strict=False).not_modelled) == ["R41_S20"]
 
 
 def test_electrons_are_those_of_the_magnitudes(config, magnitudes, places):
@@ -347,7 +347,7 @@ def test_the_stars_of_the_catalogue_are_observed(tmp_path, config, sky, magnitud
     for name in "ab":
         (tmp_path / name).mkdir()
         with experiment.screens():
-            simulated = simulate_ccds(experiment, partial(write_ccd, experiment, tmp_path / name), strict=False)
+            simulated = simulate_ccds(experiment, partial(write_ccds, experiment, tmp_path / name), strict=False)
     assert simulated.not_modelled == {"R41_S20": "3 stars of stars.csv lie on it: expected at least 5"}
     path = tmp_path / "a" / "ccd_R22_S11.fits"
     assert path.read_bytes() == (tmp_path / "b" / "ccd_R22_S11.fits").read_bytes()

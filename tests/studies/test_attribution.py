@@ -15,7 +15,7 @@ from pachon.pipeline.config import load_configuration, with_options
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.focal_plane_stage import apply_focal_plane_model
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
-from pachon.pipeline.simulate.ccd_model import model_ccd
+from pachon.pipeline.simulate.ccd_model import model_ccd, model_ccds
 from pachon.pipeline.summary import correlations
 from pachon.reconstruction.ccd_product import CCD_KINDS, KINDS
 from pachon.studies.attribution import attribution
@@ -173,12 +173,14 @@ def test_a_ccd_that_one_case_cannot_model_is_left_out_of_all(tiny, monkeypatch):
     options = {"psf__engine": "long_exposure"}
     alone = attribute(tiny(**options, ccds=("R22_S11",)), ("diffusion",), threads=1)
 
-    def model_or_fail(experiment, exposure, **how):
-        if experiment.config.psf.diffusion_pixels == 0.0 and exposure.name != "R22_S11":
-            raise DomainError("stamps[3] has no flux left outside its outliers")
-        return model_ccd(experiment, exposure, **how)
+    def model_or_fail(experiment, exposures, **how):
+        products = model_ccds(experiment, exposures, **how)
+        if experiment.config.psf.diffusion_pixels:
+            return products
+        error = DomainError("stamps[3] has no flux left outside its outliers")
+        return [p if e.name == "R22_S11" else error for e, p in zip(exposures, products, strict=True)]
 
-    monkeypatch.setattr(attribution, "model_ccd", model_or_fail)
+    monkeypatch.setattr(attribution, "model_ccds", model_or_fail)
     found = attribute(tiny(**options, ccds=("R22_S11", "R24_S12")), ("diffusion",), threads=1)
     assert found.left_out == {"R24_S12": "stamps[3] has no flux left outside its outliers"}
     assert repr(found.metrics) == repr(alone.metrics)  # NaN are equal

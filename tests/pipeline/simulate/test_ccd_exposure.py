@@ -1,6 +1,7 @@
 """Exposures of several CCDs by one call of the engine."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -46,6 +47,16 @@ def test_fields_of_groups_have_the_bytes_of_each_alone(experiment, stars):
     assert np.array_equal(together, np.concatenate(alone))
 
 
+@pytest.mark.parametrize("angle", [0.7, math.pi / 2])
+def test_fields_of_a_turned_camera_are_those_of_turned_positions(experiment, stars, angle):
+    # At a right angle x of the detector depends on y of the sky alone.
+    c, s = math.cos(angle), math.sin(angle)
+    xy = stars[NAMES[1]].observed
+    turned = fields_at(experiment.telescope.with_rotator(angle), xy @ np.array([[c, -s], [s, c]]), 620e-9)
+    # The search ends within 1e-12 m of a target, 1e-13 of the focal length.
+    np.testing.assert_allclose(turned, fields_at(experiment.telescope, xy, 620e-9), rtol=0.0, atol=1e-13)
+
+
 @pytest.mark.long
 def test_an_error_names_its_ccd_after_the_ccds_before_it(experiment, stars):
     # Far outside the field no light arrives.
@@ -54,7 +65,7 @@ def test_an_error_names_its_ccd_after_the_ccds_before_it(experiment, stars):
     with pytest.raises(DomainError, match=f"CCD {NAMES[1]}"):
         ccd_loop.simulate_ccds(
             experiment,
-            lambda exposure: modelled.append(exposure.name),
+            lambda exposures: [modelled.append(exposure.name) for exposure in exposures],
             NAMES,
             fields={NAMES[0]: stars[NAMES[0]], NAMES[1]: dark},
             threads=1,

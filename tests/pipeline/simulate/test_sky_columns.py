@@ -8,7 +8,8 @@ import pytest
 import pachon
 from pachon.measure.shapes import Shapes
 from pachon.pipeline.experiment import Experiment
-from pachon.pipeline.simulate.ccd_model import _sky_columns
+from pachon.pipeline.simulate.ccd_model import _jacobians, _sky_columns
+from pachon.pipeline.simulate.sky_axes import sky_jacobians
 
 AIM = {"ra_deg": 53.1, "dec_deg": -27.8, "position_angle_deg": 40.0}
 
@@ -21,7 +22,9 @@ def test_ellipticities_are_those_of_the_pixels_carried_by_the_wcs(tiny, ccd):
     e1, e2 = rng.normal(0.0, 0.05, (2, 10))
     g1, g2 = rng.normal(0.0, 0.1, (2, 10))
     shapes, moments = Shapes(e1, e2, *[np.zeros(10)] * 5), SimpleNamespace(g1=g1, g2=g2)
-    columns = _sky_columns(experiment, camera.from_pixel(index, pixels), shapes, moments)
+    # Another group before it, that of another CCD, changes nothing.
+    jacobians = sky_jacobians(experiment, [camera.centers[:1], camera.from_pixel(index, pixels)])[1]
+    columns = _sky_columns(jacobians, shapes, moments)
     light = experiment.wavelengths[len(experiment.wavelengths) // 2]
     center, roll = np.deg2rad([AIM["ra_deg"], AIM["dec_deg"]]), np.deg2rad(AIM["position_angle_deg"])
     wcs = pachon.wcs(experiment.telescope, ccd, center, roll, wavelength=light)
@@ -34,4 +37,5 @@ def test_ellipticities_are_those_of_the_pixels_carried_by_the_wcs(tiny, ccd):
 
 def test_without_a_pointing_there_are_none(tiny):
     experiment = Experiment.from_config(tiny(ccds=("R22_S11",)))
-    assert _sky_columns(experiment, np.zeros((1, 2)), Shapes(*np.zeros((7, 1))), None) == {}
+    (jacobians,) = _jacobians(experiment, [None])
+    assert _sky_columns(jacobians, Shapes(*np.zeros((7, 1))), None) == {}
