@@ -24,6 +24,10 @@ from .stamps import Match, Pixels, match_template, measured_variance
 SMALLEST_DONUT = 24.0
 #: Pixels across a donut in the coarse fit, about.
 _COARSE_DIAMETER = 30.0
+#: Diameters of a donut from its middle, and pixels beyond, within which a stamp is fitted: stars farther away do not
+#: overlap with it, and the sky there tells nothing of its wavefront.
+_ROOM_DIAMETERS = 1.0
+_ROOM_PIXELS = 12.0
 #: Pulls of pixels that are clipped, over that of typical pixels.
 _CLIP = 7.0
 #: Light over the brightest, above which a pixel of the model is one of the donut.
@@ -117,6 +121,15 @@ class StarFitter:
         #: Cells across the pupil that the last fits are expected to need, so that the first ones share them.
         self._across = self._sampling(self._fwhm, self._side(self._fwhm))[1].across
 
+    def near(self, match: Match, side: int) -> tuple[int, int]:
+        """Return the sides [pixels] of the middle of the stamp that has all light of a match on pixels of a side."""
+        room = _ROOM_DIAMETERS * self._light.diameter / self.instrument.pixel + _ROOM_PIXELS
+        ny, nx = (
+            n - 2 * max(math.floor(0.5 * n - room - side * abs(place)), 0)
+            for n, place in zip(self.clean.image.shape, (match.y, match.x), strict=True)
+        )
+        return ny, nx
+
     @property
     def light(self) -> StarLight:
         """Light of the star."""
@@ -178,6 +191,12 @@ class StarFitter:
                 return rays
         return self._rays.setdefault(across, self.instrument.rays(light, across))
 
+    def central(self, shape: tuple[int, int]) -> StarFitter:
+        """Return the same for the pixels [ny, nx] about the middle of the stamp."""
+        fitter = copy(self)
+        fitter.clean, fitter._binned = self.clean.central(shape), {}
+        return fitter
+
     def with_used(self, used: np.ndarray) -> StarFitter:
         """Return the same without some of the pixels."""
         fitter = copy(self)
@@ -220,8 +239,9 @@ class StarFitter:
         assert fine is not None
         if self.searches_rims:
             solved = self.rim_solver(FINE, fine.of)
-            fitter, stamp, best = self.with_moved_rims(fine.stamp, best, 0.0, solved)
-            return fitter._clipped(replace(fine, stamp=stamp), best)
+            fitter, stamp, moved = self.with_moved_rims(fine.stamp, best, 0.0, solved)
+            if moved.converged or not best.converged:
+                return fitter._clipped(replace(fine, stamp=stamp), moved)
         return self._clipped(fine, best)
 
     def _clipped(self, fine: _Fine, best: Solution) -> StarSolution:
@@ -310,7 +330,7 @@ class StarFitter:
     def start(self) -> Start:
         """Return where the template of a star without aberrations fits best, in coarse pixels."""
         across = self._light.diameter / self.instrument.pixel
-        pixels = self.clean.smoothed(max(1, round(across / _COARSE_DIAMETER)) if self.donut else 1)
+        pixels = self.clean.smoothed(max(1, round(across / _COARSE_DIAMETER))) if self.donut else self.clean
         stamp = self.stamp(self._light, pixels)
         return self.start_on(pixels, stamp)
 
