@@ -44,7 +44,7 @@ from .noise import PixelNoise, faint_level, measured_noise, smoothed
 from .result import DonutFit
 from .rim_amplitude import VOTERS, RimAmplitude, rim_amplitude, waves_fit_better
 from .rim_table import moved_rims, rim_table
-from .stamps import Pixels
+from .stamps import Pixels, central_slices
 from .star_errors import ErrorParts
 from .star_fitter import SMALLEST_DONUT, StarSolution
 from .wavefront_fits import NOLL, FittedStars, SingleDonuts, UsableStars, WavefrontFit
@@ -333,7 +333,7 @@ def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> D
     chi2, n_pixels = np.full(count, np.nan), np.zeros(count, dtype=np.int64)
     model, used = np.full(observed.images.shape, np.nan), np.zeros(observed.images.shape, dtype=bool)
     for i, star in zip(usable, fitted.stars, strict=True):
-        n, (ny, nx) = len(star.unknowns), star.model.shape
+        n, middle = len(star.unknowns), central_slices(observed.shapes[i], star.model.shape)
         values[i, :n], errors[i, :n] = star.unknowns, np.sqrt(np.diag(star.covariance))
         # Fluxes of neighbours are relative ones.
         values[i, [FLUX, BACKGROUND, SLOPE_X, SLOPE_Y]] *= units[i]
@@ -342,7 +342,7 @@ def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> D
         zernikes[i], covariance[i] = star.zernikes, star.errors.total
         for cause, covariances in parts.items():
             covariances[i] = getattr(star.errors, cause)
-        model[i, :ny, :nx], used[i, :ny, :nx] = units[i] * star.model + levels[i], star.pixels.used
+        model[i][middle], used[i][middle] = units[i] * star.model + levels[i], star.pixels.used
         noise[i] = units[i] ** 2 * np.median(star.pixels.variance)
         chi2[i] = (pulls(star.pixels, star.model)[star.pixels.used] ** 2).sum()
         n_pixels[i] = star.pixels.used.sum()

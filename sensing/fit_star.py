@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -108,8 +109,10 @@ def fit_star(
     donut = across > SMALLEST_DONUT
     fitter = StarFitter(instrument, light, without_bad_pixels(pixels) if donut else pixels, strength, wavefront)
     if begun is not None and begun.usable is not None and not begun.flags & ~_BESIDE_THE_SEARCH:
-        return _finished(fitter, pixels, begun.usable.solution, begun.sides, sky_level)
-    start = fitter.start()
+        shape = begun.usable.full.used.shape
+        return _finished(fitter.central(shape), pixels.central(shape), begun.usable.solution, begun.sides, sky_level)
+    fitter, start = _started(fitter)
+    pixels = pixels.central(fitter.clean.image.shape)
     flags = DonutFlag.OK
     if not start.match.significance >= _FOUND:
         flags |= DonutFlag.NO_DONUT
@@ -137,6 +140,32 @@ def fit_star(
     if fitter.lost_light(start.stamp, best).any_pixel > _LOST:
         return StarFit(DonutFlag.MOSTLY_LOST)
     return _finished(fitter, pixels, best, sides, sky_level)
+
+
+class CoarseFit(NamedTuple):
+    """Loss of a fit in coarse pixels, and how many of these are independent of each other."""
+
+    loss: float
+    n_independent: float
+
+
+def coarse_fit(instrument: Instrument, light: StarLight, pixels: Pixels, strength: float) -> CoarseFit | None:
+    """Return the fit of a star alone in coarse pixels, None without one; arguments as those of :func:`fit_star`."""
+    fitter, start = _started(StarFitter(instrument, light, without_bad_pixels(pixels), strength, wavefront=True))
+    if not start.match.significance >= _FOUND:
+        return None
+    search = _search(fitter, start)
+    return CoarseFit(search.best.loss, search.start.pixels.independent * search.start.stamp.used.sum())
+
+
+def _started(fitter: StarFitter) -> tuple[StarFitter, Start]:
+    """Return the start of a search, and the fitter for the part of the stamp about the donut."""
+    start = fitter.start()
+    shape = fitter.near(start.match, start.pixels.side) if fitter.donut else fitter.clean.image.shape
+    if shape == fitter.clean.image.shape:
+        return fitter, start
+    fitter = fitter.central(shape)
+    return fitter, fitter.start()
 
 
 def _finished(
@@ -178,8 +207,8 @@ class _Search:
 
     @property
     def misfit(self) -> float:
-        """Loss a coarse pixel, beyond that of noise."""
-        return _misfit(self.start.pixels, self.start.stamp, self.best)
+        """Loss a coarse pixel, of which smoothed noise has next to nothing."""
+        return _misfit(self.start.stamp, self.best)
 
 
 def _search(fitter: StarFitter, start: Start) -> _Search:
@@ -210,8 +239,7 @@ def _search_of_rims(fitter: StarFitter, search: _Search) -> _Search:
         return search
     start = search.start
     solved = fitter.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, start.pixels))
-    limit = _MISFIT + _noise(start.pixels)
-    fitter, stamp, best = fitter.with_moved_rims(start.stamp, search.single, limit, solved, start.unknowns)
+    fitter, stamp, best = fitter.with_moved_rims(start.stamp, search.single, _MISFIT, solved, start.unknowns)
     if not best.loss < search.best.loss:
         return search
     trial = _Search(fitter, replace(start, stamp=stamp), best, best)
@@ -253,9 +281,7 @@ def _with_neighbours(fitter: StarFitter, start: Start, single: Solution) -> Solu
     """Return the solution with neighbours if there are any, else that without."""
     room = fitter.stamp(fitter.light, start.pixels, blended=True)
     diameter = fitter.light.diameter / fitter.instrument.pixel
-    return NeighbourSearch(
-        room, fitter.solve, start.unknowns, start.template, diameter, _noise(start.pixels)
-    ).from_single(single)
+    return NeighbourSearch(room, fitter.solve, start.unknowns, start.template, diameter).from_single(single)
 
 
 def _both_sides(fitter: StarFitter, start: Start, solution: Solution) -> tuple[BothSides | None, Solution | None]:
@@ -295,7 +321,7 @@ def _loss_scale(loss: float) -> float:
 
 def _other_focus_is_better(fitter: StarFitter, start: Start, solution: Solution, mirrored: Solution | None) -> bool:
     """Return whether the image fits a detector on the other side of focus better."""
-    misfit = _misfit(start.pixels, start.stamp, solution)
+    misfit = _misfit(start.stamp, solution)
     if misfit < _MISFIT:
         return False
     if mirrored is None or misfit > _POOR:
@@ -305,14 +331,9 @@ def _other_focus_is_better(fitter: StarFitter, start: Start, solution: Solution,
     return explains_more(mirrored, solution)
 
 
-def _misfit(pixels: Pixels, stamp: Stamp, solution: Solution) -> float:
-    """Return the loss a pixel, beyond that of the noise of pixels of small donuts, which are not smoothed."""
-    return float(solution.loss) / max(int(stamp.used.sum()), 1) - _noise(pixels)
-
-
-def _noise(pixels: Pixels) -> float:
-    """Return the loss a pixel that noise makes: next to nothing where pixels are smoothed."""
-    return 0.0 if pixels.blur else 1.0
+def _misfit(stamp: Stamp, solution: Solution) -> float:
+    """Return the loss a pixel."""
+    return float(solution.loss) / max(int(stamp.used.sum()), 1)
 
 
 def _is_between(value: float, limits: tuple[float, float]) -> bool:

@@ -8,6 +8,7 @@ edges into the light by as much as that of a straight edge.
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
@@ -16,10 +17,10 @@ from scipy.special import fresnel
 from ..core.errors import DomainError, PrescriptionWarning
 from ..core.statistics import FWHM_PER_RMS
 from ..models.telescope import Telescope
-from ..raytrace.rays import parallel_rays
-from .donut_rays import chief_landing, landing_of
 from .flags import DonutFlag
-from .light import Instrument, StarLight
+from .image_model import FLUX, NUISANCES, STRENGTH
+from .light import Instrument
+from .likelihood import model_image
 from .pupil_cells import pupil_cells
 from .result import DonutFit
 from .star_fitter import StarSolution
@@ -71,7 +72,7 @@ def donut_obscurations(
     """
     clear = [i for i in solutions if not DonutFlag(int(fit.flags[i])) & _UNFIT]
     brightest = sorted(clear, key=lambda i: -fit.flux[i])[:_DONUTS]
-    ratios = np.array([_ratios(instrument, solutions[i].light, fit, i) for i in brightest]).reshape(-1, 2, _QUADRANTS)
+    ratios = np.array([_ratios(instrument, solutions[i], fit, i) for i in brightest]).reshape(-1, 2, _QUADRANTS)
     donut, model = np.moveaxis(ratios, 1, 0)
     # An image of the telescope that has no hole tells no scale.
     shown = np.where(model > 0.0, donut * lit / np.where(model > 0.0, model, 1.0), donut)
@@ -89,18 +90,18 @@ def lit_obscuration(telescope: Telescope, wavelength: float) -> float:
     return inner / outer
 
 
-def _ratios(instrument: Instrument, light: StarLight, fit: DonutFit, i: int) -> list[np.ndarray]:
+def _ratios(instrument: Instrument, star: StarSolution, fit: DonutFit, i: int) -> list[np.ndarray]:
     """Return inner over outer radius of a donut and of the telescope's image in the same seeing, quadrant by quadrant.
 
     NaN where the edges are not clear.
     """
-    image, used, pixel = fit.images[i] - fit.background[i], fit.used[i], instrument.pixel
+    image, used, pixel, light = fit.images[i] - fit.background[i], fit.used[i], instrument.pixel, star.light
     fwhm = fit.fwhm[i] * light.scale / pixel
-    cells = pupil_cells(light.telescope, light.direction, instrument.middle, _CELLS)
-    rays = parallel_rays(light.telescope, light.direction[None], instrument.middle, cells.points)
-    landing = landing_of(light.telescope, rays)
-    places = (landing - chief_landing(light.telescope, light.direction, instrument.middle)) / pixel
-    telescope_image = _image(places, cells.weights, max(image.shape), max(fwhm, 2.0))
+    unknowns = np.zeros(len(NUISANCES))
+    unknowns[[FLUX, STRENGTH]] = 1.0, star.solution.stars[0][STRENGTH]
+    grid = star.full.grid
+    rays_alone = star.full if grid.rim_light is None else replace(star.full, grid=grid.of_rays_alone())
+    telescope_image = model_image(rays_alone, unknowns, np.zeros_like(star.solution.waves[0]))
     inner, outer, level = _edges_of_quadrants(image, used)
     model = _edges_of_quadrants(telescope_image, np.ones(telescope_image.shape, dtype=bool))
     pixels = 2.0 * np.pi * np.maximum(inner, _LEAST_PIXELS) / _QUADRANTS

@@ -160,6 +160,12 @@ class ImageGrid:
         """Return the grid of a model of rays with diffraction at rims of the pupil."""
         return ImageGrid(*self._arguments, rims)
 
+    def of_rays_alone(self) -> ImageGrid:
+        """Return the grid without diffraction."""
+        grid = copy(self)
+        grid.last, grid.rim_light = None, None
+        return grid
+
     def with_rims(self, rims: PupilRims) -> ImageGrid:
         """Return the grid for other rims of the pupil."""
         grid = copy(self)

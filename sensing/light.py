@@ -14,7 +14,7 @@ from ..raytrace.rays import RayStatus
 from ..raytrace.trace import TraceResult, trace
 from ..wavefront.chief_rays import image_jacobians
 from ..wavefront.psf.light import Light
-from ..wavefront.psf.pupil_rims import PupilRims, pupil_rims
+from ..wavefront.psf.pupil_rims import PIECES, PupilRims, pupil_rims
 from ..wavefront.request import relative_weights, wavelength_points
 from .donut_rays import ZernikeRays, chief_landing
 from .image_model import ImageGrid
@@ -66,6 +66,9 @@ _BINNED = 1.95
 _MOST_BINNED = 4
 #: Least fraction of the pixels in use that binning keeps.
 _KEPT = 0.95
+#: Pieces of a diffracting rim over the diameter of the donut in pixels, and the least number of them.
+_PIECES_A_PIXEL = 1.6
+_FEWEST_PIECES = 64
 #: Shift of a rim that is free by itself, over that of others.
 _HELD = 1e-3
 #: Full width at half maximum of a Gaussian over its rms.
@@ -167,7 +170,10 @@ class Instrument:
         jacobian = image_jacobians(telescope, direction[None], self.middle, 1)[0]
         # Light passes up to half a cell beyond the outermost points.
         diameter = 2.0 * float(np.hypot(*place.T).max()) * (1.0 + 1.0 / _SURVEY)
-        diffracting = pupil_rims(telescope, direction, self.middle) if self.model.diffraction else None
+        diffracting = None
+        if self.model.diffraction:
+            pieces = math.ceil(_PIECES_A_PIXEL * diameter / self.pixel)
+            diffracting = pupil_rims(telescope, direction, self.middle, min(max(pieces, _FEWEST_PIECES), PIECES))
         rims = movable_rims(telescope, points, ends)
         light = StarLight(telescope, direction, diameter, depth, jacobian, rims, diffracting)
         if not self.model.rims.size:
@@ -346,7 +352,8 @@ class StarLight:
         if diffracting is not None:
             # Rings alone diffract: a hole that stands aside does so about the centre, a part of a pixel away.
             rings = tuple(replace(s, aperture=concentric(s.aperture)) for s in telescope.surfaces)
-            diffracting = pupil_rims(replace(telescope, surfaces=rings), self.direction, wavelength)
+            outlines = replace(telescope, surfaces=rings)
+            diffracting = pupil_rims(outlines, self.direction, wavelength, diffracting.pieces)
         return replace(self, telescope=telescope, pupil_rims=diffracting, free_rims=rims, prescribed=prescribed)
 
     @property

@@ -63,8 +63,6 @@ class NeighbourSearch:
         Image of a star of unit flux without aberrations in the middle of the stamp.
     diameter : float
         Diameter of the donut [pixels of the detector].
-    noise : float
-        Loss a pixel that noise makes.
     """
 
     stamp: Stamp
@@ -72,7 +70,6 @@ class NeighbourSearch:
     first: np.ndarray
     template: np.ndarray
     diameter: float
-    noise: float
 
     def from_single(self, single: Solution) -> Solution:
         """Return the best solution with neighbours if there are any, else that without.
@@ -92,7 +89,7 @@ class NeighbourSearch:
         return _central_first(best)
 
     def _misfit(self, solution: Solution) -> float:
-        return solution.loss / max(int(self.stamp.used.sum()), 1) - self.noise
+        return solution.loss / max(int(self.stamp.used.sum()), 1)
 
     def _extended(self, solution: Solution) -> Solution:
         """Return a solution with the neighbours that its residuals show, one after the other."""

@@ -8,6 +8,7 @@ the same field angles. Fields and stamps that are mirrored together fit as well 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -15,16 +16,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.arguments import check_arguments
+from ..core.errors import DomainError
 from ..core.plotting import BLUE, axes_at, styled
 from ..core.result import Result
+from ..core.threads import one_blas_thread, thread_count
 from ..models.telescope import Telescope
 from ..raytrace.rays import Projection
 from ..wavefront.psf.light import Light
-from .fit import fit_donuts
+from .fit_star import coarse_fit
 from .frames import along_camera, stamp_matrix
-from .inputs import ObservedStars
+from .inputs import ObservedStar, ObservedStars
+from .light import Instrument
 from .model import DonutModel
-from .wavefront_fits import SingleDonuts
+from .noise import faint_level, measured_noise, smoothed
+from .stamps import Pixels
+from .terms import WavefrontTerms
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,10 +38,8 @@ if TYPE_CHECKING:
 
 #: Axes of columns and rows of stamps, the given ones first: four turns, and their mirror images.
 ORIENTATIONS = ("x,y", "y,x", "-x,y", "x,-y", "-y,-x", "-x,-y", "-y,x", "y,-x")
-#: Fit of the wavefront: terms up to the fourth degree are enough for shadows.
-_FIT = SingleDonuts(range(4, 12), left_out=0.0)
-#: Pixels across a stamp: more are added up to squares.
-_PIXELS = 60
+#: Terms of the wavefront: those up to the fourth degree are enough for shadows.
+_TERMS = WavefrontTerms.of(np.arange(4, 12))
 #: Cells across the pupil.
 _CELLS = 40
 #: Least gain in chi-square, over that of a pixel of the best fit, with which another orientation is better.
@@ -67,7 +71,7 @@ class OrientationCheck(Result):
     donuts : ndarray of int
         Indices of the donuts that were fitted.
     n_pixels : int
-        Pixels of them.
+        Pixels of them, as many as are independent of each other.
     """
 
     _table = ("stamp_axes", "excess", "chi2")
@@ -133,7 +137,7 @@ def check_orientation(
     Parameters
     ----------
     telescope, images, fields, wavelength, sky_variance, model, mask, projection, threads
-        As in :func:`~pachon.fit_donuts`. Stamps are fitted as rays, in coarse pixels.
+        As in :func:`~pachon.fit_donuts`. Stamps are fitted as rays, smoothed to coarse pixels.
     donuts : int
         Largest number of donuts that are fitted, from the one farthest from the axis on; fewer where they settle that
         the orientation is right.
@@ -142,50 +146,56 @@ def check_orientation(
     -------
     OrientationCheck
     """
-    model = (model or DonutModel()).with_light(wavelength)
+    model = _rays_alone((model or DonutModel()).with_light(wavelength))
     observed = ObservedStars.of(images, fields, sky_variance, mask, projection)
+    instrument = Instrument.of(telescope, model, _TERMS)
     shifts = model.detector.shifts(len(observed))
+    strength = model.air.strengths(instrument.seeing, 1)[0]
     telling_donuts = _telling(observed, donuts)
-    matrices = [stamp_matrix(axes) for axes in ORIENTATIONS]
     chi2, n_pixels = np.empty((2, len(ORIENTATIONS), 0))
     check = _compared(chi2, n_pixels, telling_donuts[:0])
-    for count, index in enumerate(telling_donuts, start=1):
-        star = observed.star(int(index))
-        side = max(1, min(star.image.shape) // _PIXELS)
-        image, variance, masked = _binned(star.image, star.variance, star.masked, side)
-        turned = [[along_camera(plane, matrix) for matrix in matrices] for plane in (image, masked)]
-        level = float(np.median(variance)) if observed.known_noise else None
-        fit = fit_donuts(
-            telescope,
-            turned[0],
-            np.tile(star.field, (len(matrices), 1)),
-            sky_variance=level,
-            model=_coarse(model, side, float(shifts[index])),
-            fit=_FIT,
-            mask=turned[1],
-            projection=projection,
-            threads=threads,
-        )
-        chi2 = np.column_stack([chi2, fit.chi2])
-        n_pixels = np.column_stack([n_pixels, fit.n_pixels])
-        check = _compared(chi2, n_pixels, telling_donuts[:count])
-        if np.sort(check.excess)[1] > _SETTLED * check.threshold and not check.excess[0]:
-            break
+    with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
+        for count, index in enumerate(telling_donuts, start=1):
+            fits = _fits(instrument, observed.star(int(index)), float(shifts[index]), strength, pool)
+            chi2, n_pixels = np.column_stack([chi2, fits[:, 0]]), np.column_stack([n_pixels, fits[:, 1]])
+            check = _compared(chi2, n_pixels, telling_donuts[:count])
+            if np.sort(check.excess)[1] > _SETTLED * check.threshold and not check.excess[0]:
+                break
     return check
 
 
-def _coarse(model: DonutModel, side: int, defocus: float) -> DonutModel:
-    """Return the model of one donut of rays, in squares of so many pixels."""
-    saturation = model.detector.saturation
-    detector = replace(
-        model.detector,
-        pixel_size=model.detector.pixel() * side,
-        defocus=defocus,
-        saturation=None if saturation is None else saturation * side**2,
-    )
-    air = replace(model.air, fwhm=None, atmosphere=None)
-    rims = replace(model.rims, search=False)
-    return replace(model, detector=detector, air=air, diffraction=False, neighbours=False, rims=rims, n_pupil=_CELLS)
+def _fits(instrument: Instrument, star: ObservedStar, defocus: float, strength: float, pool: Executor) -> np.ndarray:
+    """Return chi-square and number of independent pixels of one donut in all orientations, NaN and 0 without a fit."""
+    none = np.tile([np.nan, 0.0], (len(ORIENTATIONS), 1))
+    if np.hypot(*star.field) > instrument.telescope.field_limit:
+        return none
+    try:
+        light = instrument.light(star.direction, defocus)
+    except DomainError:
+        return none
+    used = np.isfinite(star.image) & ~star.masked
+    image, variance, unit = np.where(used, star.image, 0.0), star.variance, 1.0
+    if not star.known_noise and used.any():
+        smooth = smoothed(image, used)
+        level = faint_level(smooth, used)
+        image = np.where(used, image - level, 0.0)
+        noise = measured_noise(image, smooth - level, used, level)
+        variance, unit = np.full(image.shape, noise.sky), noise.photon
+    planes = (image / unit, variance / unit**2, used)
+
+    def fitted(stamp_axes: str) -> tuple[float, float]:
+        matrix = stamp_matrix(stamp_axes)
+        turned_image, turned_variance, turned_used = (along_camera(plane, matrix) for plane in planes)
+        fit = coarse_fit(instrument, light, Pixels(turned_image, turned_variance, turned_used), strength)
+        return (np.nan, 0.0) if fit is None else (fit.loss, fit.n_independent)
+
+    return np.array(list(pool.map(fitted, ORIENTATIONS)))
+
+
+def _rays_alone(model: DonutModel) -> DonutModel:
+    """Return the model of donuts of rays, each by itself in a seeing that is not known."""
+    air, rims = replace(model.air, fwhm=None, atmosphere=None), replace(model.rims, search=False)
+    return replace(model, air=air, diffraction=False, neighbours=False, rims=rims, n_pupil=_CELLS)
 
 
 def _compared(chi2: np.ndarray, n_pixels: np.ndarray, donuts: np.ndarray) -> OrientationCheck:
@@ -212,14 +222,3 @@ def _telling(observed: ObservedStars, most: int) -> np.ndarray:
     light = np.array([np.nansum(np.where(m, 0.0, i)) for i, m in zip(observed.images, observed.masked, strict=True)])
     bright = np.flatnonzero(light > _LEAST_LIGHT * light.max())
     return bright[np.argsort(-np.hypot(*observed.fields[bright].T), kind="stable")][:most]
-
-
-def _binned(
-    image: np.ndarray, variance: np.ndarray, masked: np.ndarray, side: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return sums over squares of pixels of an image and its variance, and squares with a masked pixel."""
-    ny, nx = (n // side for n in image.shape)
-    unusable = masked | ~np.isfinite(image)
-    planes = (np.where(unusable, 0.0, image), variance, unusable.astype(np.int64))
-    total = [v[: ny * side, : nx * side].reshape(ny, side, nx, side).sum(axis=(1, 3)) for v in planes]
-    return total[0], total[1], total[2] > 0

@@ -103,6 +103,7 @@ def residual_power(
     resolution: float,
     patterns: np.ndarray | None = None,
     expected: np.ndarray | None = None,
+    prior_gradient: np.ndarray | None = None,
 ) -> ResidualPower:
     """Return what the residuals of a donut say about the errors of its unknowns.
 
@@ -118,6 +119,9 @@ def residual_power(
         Patterns over the noise, whose squares are the covariance of a further field.
     expected : ndarray, shape [n_pixel, m], optional
         The same of what the model is known to lack, within the span of the patterns.
+    prior_gradient : ndarray, shape [n], optional
+        Precisions of the priors times the deviations of the unknowns from their means: residuals are then those at the
+        end of the last step of a search, which stops a part of a standard deviation short of it.
     """
     spreads = np.sqrt(np.diag(covariance))
     scale = np.where(spreads > 0.0, spreads, 1.0)
@@ -126,6 +130,8 @@ def residual_power(
     squares = _Squares(linearized.used)
     columns = squares.of(linearized.columns @ (linearized.scales[:, None] * root).astype(np.float32))
     pulls = squares.of(linearized.pulls.astype(np.float32)[:, None])[:, 0]
+    if prior_gradient is not None:
+        pulls = pulls - columns @ (columns.T @ pulls - root.T @ prior_gradient).astype(np.float32)
     beside = None if patterns is None else _Patterns.of(squares.of(patterns), columns, pulls)
     if beside is not None:
         pulls, columns = pulls - beside.columns @ beside.amplitudes, np.hstack([columns, beside.columns])

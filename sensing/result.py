@@ -106,7 +106,8 @@ class DonutFit(Result):
         Neighbours of a blend, the brightest first: flux over that of the star, and place (x, y) from it [pixels]; NaN
         beyond those found.
     images, model : ndarray, shape [n, ny, nx]
-        Stamps and their best models [electrons]; NaN beside smaller stamps, and models of flagged donuts are NaN.
+        Stamps and their best models [electrons]; NaN beside smaller stamps. Models of flagged donuts are NaN, and those
+        of others far from a donut on a stamp that is much larger.
     used : ndarray of bool, shape [n, ny, nx]
         Pixels that took part.
     fields : ndarray, shape [n, 2]

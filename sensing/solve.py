@@ -22,6 +22,9 @@ COARSE = 0.3
 STEPS = 25
 #: The same for a search that ran out of steps and is near enough to its end.
 _NEAR = 1.0
+#: Part of what the model leaves beyond noise, or of noise itself if that is less, that a step is to explain: where it
+#: lacks much, its derivatives are not good enough for the last hundredth, and errors have what is left.
+_EXPLAINED = 1e-2
 #: Damping of the first step, in units of the curvature.
 _DAMPING = 1e-3
 #: Least strength of the turbulence [1/m].
@@ -144,9 +147,9 @@ def solve(
             joined, state, damping = trial, trial_state, 0.1 * damping
         else:
             damping = 10.0 * max(damping, _DAMPING)
-            if damping > _LARGEST_DAMPING:
+            if damping > _LARGEST_DAMPING or predicted < _worth(state.loss, pixels):
                 break
-    converged = converged or predicted < _NEAR * max(1.0, state.loss / pixels)
+    converged = converged or predicted < max(_NEAR, _NEAR * state.loss / pixels, _worth(state.loss, pixels))
     covariance = np.zeros_like(state.curvature)
     free = np.ix_(~held, ~held)
     scale = np.sqrt(np.maximum(np.diag(state.curvature)[~held], 1e-300))
@@ -157,6 +160,11 @@ def solve(
     best = joined[bounds[-1] :]
     waves = tuple(m @ best for m in group.maps)
     return Solution(star_unknowns, best, waves, covariance, state.chi2, state.loss, converged)
+
+
+def _worth(loss: float, pixels: int) -> float:
+    """Return the gain of a step that is worth while where the model leaves more than noise."""
+    return _EXPLAINED * min(loss - pixels, pixels)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -54,14 +54,24 @@ class Pixels:
     blur: float = 0.0
     offset: tuple[float, float] = (0.0, 0.0)
 
+    @property
+    def independent(self) -> float:
+        """Mean square of white noise over the variance: 1 but for smoothed pixels."""
+        # Sums of squares of the weights of a Gaussian of the squares of the new side.
+        return (self.side / self.blur) ** 2 / (4.0 * math.pi) if self.blur else 1.0
+
+    def central(self, shape: tuple[int, int]) -> Pixels:
+        """Return the pixels [ny, nx] about the middle, of sides that differ from those of all by even numbers."""
+        rows, columns = central_slices(self.image.shape, shape)
+        image, variance, used = (v[rows, columns] for v in (self.image, self.variance, self.used))
+        return replace(self, image=image, variance=variance, used=used)
+
     def smoothed(self, side: int) -> Pixels:
         """Return the image smoothed by a Gaussian and sampled at every so many pixels, for a quick first fit.
 
         Values are those of squares of the new side. So is the variance: the noise of the new pixels is smaller and
         correlated, and sums of the squares of smooth signals over the variance come out the same.
         """
-        if side == 1:
-            return self
         blur = _SMOOTHING * side
         count = [(n - 1) // side + 1 for n in self.image.shape]
         first = [(n - 1 - (m - 1) * side) // 2 for n, m in zip(self.image.shape, count, strict=True)]
@@ -99,6 +109,12 @@ class Pixels:
         # Pixels that are left over at the end move the centre.
         offset = tuple(0.5 * (n % side) / side for n in self.image.shape[::-1])
         return Pixels(image, variance, unused == 0, side, side, 0.0, (offset[0], offset[1]))
+
+
+def central_slices(shape: tuple[int, ...], inner: tuple[int, ...]) -> tuple[slice, slice]:
+    """Return rows and columns of the middle of an image, of sides that differ from its own by even numbers."""
+    rows, columns = (slice((n - m) // 2, (n + m) // 2) for n, m in zip(shape, inner, strict=True))
+    return rows, columns
 
 
 def plane_basis(used: np.ndarray) -> np.ndarray:

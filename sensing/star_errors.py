@@ -113,7 +113,16 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     point = linearized(star.stamp, solution.stars[0], solution.waves[0])
     if point is not None and len(solution.shared):
         beside = _TermsBeside(instrument, star, point)
-        power = residual_power(point, photons, _resolution(instrument, star), beside.patterns, beside.unfitted)
+        precision = np.concatenate([np.zeros(n_star), terms.precision, star.light.shift_precision])
+        means = np.concatenate([np.zeros(n_star + len(terms.precision)), star.light.shift_mean])
+        power = residual_power(
+            point,
+            photons,
+            _resolution(instrument, star),
+            beside.patterns,
+            beside.unfitted,
+            precision * (np.concatenate([solution.stars[0], solution.shared]) - means),
+        )
         residuals = power.covariance
         lacking += residuals[:n_star, :n_star]
         figure = beside.figure(photons)[wavefront, wavefront]

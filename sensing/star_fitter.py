@@ -24,6 +24,10 @@ from .stamps import Match, Pixels, match_template, measured_variance
 SMALLEST_DONUT = 24.0
 #: Pixels across a donut in the coarse fit, about.
 _COARSE_DIAMETER = 30.0
+#: Diameters of a donut from its middle, and pixels beyond, within which a stamp is fitted: farther away, stars
+#: hardly overlap with it, and the sky tells nothing of its wavefront.
+_ROOM_DIAMETERS = 0.8
+_ROOM_PIXELS = 12.0
 #: Pulls of pixels that are clipped, over that of typical pixels.
 _CLIP = 7.0
 #: Light over the brightest, above which a pixel of the model is one of the donut.
@@ -32,6 +36,8 @@ BRIGHT = 0.2
 _ROUNDS = 3
 #: Most scales of the last fits.
 _SCALES = 3
+#: Most steps of a fit with few cells that finds the seeing.
+_SEEING_STEPS = 8
 #: Fraction of the seeing that a search starts from below which that of a first solution is taken in its place.
 _MUCH_SHARPER = 0.5
 #: Cells across the pupil beyond those of a first search from which on it has some of its own.
@@ -91,11 +97,12 @@ class LostLight:
 
 @dataclass(frozen=True)
 class _Fine:
-    """A stamp for the last fits, and how it is sampled."""
+    """A stamp for the last fits, how it is sampled, and whether by few cells that find the seeing alone."""
 
     stamp: Stamp
     pixels: Pixels
     sampling: Sampling
+    few_cells: bool = False
 
     def of(self, fitter: StarFitter) -> Stamp:
         """Return the stamp sampled alike for the light of a fitter."""
@@ -116,6 +123,15 @@ class StarFitter:
         self._binned: dict[int, Pixels] = {}
         #: Cells across the pupil that the last fits are expected to need, so that the first ones share them.
         self._across = self._sampling(self._fwhm, self._side(self._fwhm))[1].across
+
+    def near(self, match: Match, side: int) -> tuple[int, int]:
+        """Return the sides [pixels] of the middle of the stamp that has all light of a match on pixels of a side."""
+        room = _ROOM_DIAMETERS * self._light.diameter / self.instrument.pixel + _ROOM_PIXELS
+        ny, nx = (
+            n - 2 * max(math.floor(0.5 * n - room - side * abs(place)), 0)
+            for n, place in zip(self.clean.image.shape, (match.y, match.x), strict=True)
+        )
+        return ny, nx
 
     @property
     def light(self) -> StarLight:
@@ -178,6 +194,12 @@ class StarFitter:
                 return rays
         return self._rays.setdefault(across, self.instrument.rays(light, across))
 
+    def central(self, shape: tuple[int, int]) -> StarFitter:
+        """Return the same for the pixels [ny, nx] about the middle of the stamp."""
+        fitter = copy(self)
+        fitter.clean, fitter._binned = self.clean.central(shape), {}
+        return fitter
+
     def with_used(self, used: np.ndarray) -> StarFitter:
         """Return the same without some of the pixels."""
         fitter = copy(self)
@@ -216,12 +238,14 @@ class StarFitter:
             finer = self.sampled(best, blended, fine)
             if finer is fine:
                 break
-            fine, best = finer, self.solve(finer.stamp, best.stars[0], best.shared)
+            steps = _SEEING_STEPS if finer.few_cells else STEPS
+            fine, best = finer, self.solve(finer.stamp, best.stars[0], best.shared, steps=steps)
         assert fine is not None
         if self.searches_rims:
             solved = self.rim_solver(FINE, fine.of)
-            fitter, stamp, best = self.with_moved_rims(fine.stamp, best, 0.0, solved)
-            return fitter._clipped(replace(fine, stamp=stamp), best)
+            fitter, stamp, moved = self.with_moved_rims(fine.stamp, best, 0.0, solved)
+            if moved.converged or not best.converged:
+                return fitter._clipped(replace(fine, stamp=stamp), moved)
         return self._clipped(fine, best)
 
     def _clipped(self, fine: _Fine, best: Solution) -> StarSolution:
@@ -265,7 +289,7 @@ class StarFitter:
 
     def sampled(self, solution: Solution, blended: bool, last: _Fine | None) -> _Fine:
         """Return a stamp fine enough for the seeing of a solution: the last one if that is, nearly."""
-        instrument, light = self.instrument, self._light
+        instrument, light, few_cells = self.instrument, self._light, False
         if last is None:
             fwhm = self._fwhm
             if not instrument.known_seeing:
@@ -275,7 +299,7 @@ class StarFitter:
             pixels, sampling = self._sampling(fwhm, self._side(fwhm))
             if sampling.sharp and not instrument.known_seeing and instrument.model.n_pupil is None:
                 # Few large cells find the seeing, of which a sharp image says much.
-                sampling = replace(sampling, across=sampling.across // 2)
+                sampling, few_cells = replace(sampling, across=sampling.across // 2), True
         else:
             fwhm = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
             wave = slice(len(instrument.noll)) if len(solution.shared) else slice(0)
@@ -288,7 +312,7 @@ class StarFitter:
                 return last
             pixels, sampling = self._sampling(fwhm, min(self._side(fwhm), last.pixels.side), error)
         stamp = self.sampled_stamp(pixels, sampling, light.diameter if blended else self._overhang(solution))
-        return _Fine(stamp, pixels, sampling)
+        return _Fine(stamp, pixels, sampling, few_cells)
 
     def _overhang(self, solution: Solution) -> float:
         """Return how far the light of a star reaches beyond the stamp [m]."""
@@ -310,7 +334,7 @@ class StarFitter:
     def start(self) -> Start:
         """Return where the template of a star without aberrations fits best, in coarse pixels."""
         across = self._light.diameter / self.instrument.pixel
-        pixels = self.clean.smoothed(max(1, round(across / _COARSE_DIAMETER)) if self.donut else 1)
+        pixels = self.clean.smoothed(max(1, round(across / _COARSE_DIAMETER))) if self.donut else self.clean
         stamp = self.stamp(self._light, pixels)
         return self.start_on(pixels, stamp)
 

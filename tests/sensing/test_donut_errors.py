@@ -111,6 +111,30 @@ def test_errors_have_the_power_of_the_residuals(blur, variance, size):
     assert np.mean(claimed) == pytest.approx(true, rel=0.25)
 
 
+def test_errors_do_not_depend_on_where_a_search_stopped():
+    """Oracle: the power at the end. Patterns that the unknowns nearly make magnify the last part of a step."""
+    size, rng = 40, np.random.default_rng(6)
+    columns, precision = smooth_columns(size), np.array([0.0, 0.0, 0.0, 0.0, 1e-3, 1e-3])
+    patterns = columns @ rng.normal(size=(6, 3)) + 1e-3 * rng.normal(size=(size**2, 3))
+    covariance = np.linalg.inv(columns.T @ columns + np.diag(precision))
+    noise = rng.normal(size=size**2)
+    best = covariance @ (columns.T @ noise)
+
+    def power(unknowns, prior=True):
+        residual = noise - columns @ unknowns
+        square, every = np.ones((size, size)), np.ones((size, size), bool)
+        light = np.abs(columns[:, 0]).reshape(size, size)
+        point = Linearized(square, square, light, every, residual, residual, columns.astype(np.float32), np.ones(6))
+        gradient = precision * unknowns if prior else None
+        return residual_power(point, covariance, 4.0, patterns.astype(np.float32), None, gradient).covariance
+
+    at_the_end, scale = power(best), np.trace(covariance)
+    # A third of a standard deviation short of it; single precision leaves 1e-3.
+    short = best + 0.3 * np.linalg.cholesky(covariance) @ rng.normal(size=6)
+    np.testing.assert_allclose(power(short), at_the_end, atol=0.01 * scale)
+    assert np.trace(power(short, prior=False)) > np.trace(at_the_end) + 3.0 * scale
+
+
 @pytest.mark.long
 def test_air_of_a_long_exposure_has_one_shape():
     """Peer: the closed form of given winds, from which its shape differs by their direction alone."""

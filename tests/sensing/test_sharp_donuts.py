@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 import pytest
-from donut_images import WAVELENGTH, blurred, fine_bins
+from donut_images import WAVELENGTH, blurred, donut, fine_bins, noisy
 
 import pachon
 
@@ -73,3 +73,32 @@ def test_sharp_donuts_without_noise(behind_focus, wave, blur):
     fit, _ = fitted(behind_focus, blurred(bins, blur, 5e6, fine=12), blur)
     assert fit.reasons == [""]
     assert np.linalg.norm(fit.zernikes[0] - wave[3:]) < 0.8e-9
+
+
+@pytest.mark.long
+def test_a_wide_stamp_is_fitted_about_its_donut(focused):
+    """Sky far from a donut tells nothing of its wavefront: place, background and wavefront are those of the stamp."""
+    tel = focused.perturbed("Detector", shift=(0.0, 0.0, 0.5e-3))
+    wave = np.zeros(22)
+    wave[[4, 7]] = 60e-9, -40e-9
+    shift, slope = (14.3, -9.6), (0.2, -0.1)
+    clean = donut(tel, FIELD, zernikes=wave, blur=2.0, shift=shift, size=181, pixel=PIXEL, rays=300)
+    rows, columns = np.mgrid[-90:91, -90:91]
+    image = noisy(clean, SKY, 4) + 30.0 + slope[0] * columns + slope[1] * rows
+    detector = pachon.DonutDetector(pixel_size=PIXEL, diffusion=2.0 * PIXEL)
+    model = pachon.DonutModel(air=pachon.DonutAir(fwhm=0.0), detector=detector, diffraction=False)
+    fit = pachon.fit_donuts(tel, image[None], [FIELD], WAVELENGTH, sky_variance=SKY, model=model, threads=1)
+    assert fit.reasons == [""]
+    error = fit.zernikes[0] - wave[3:]
+    assert error @ np.linalg.solve(fit.covariance[0], error) < 45.0  # 19 terms
+    # Five standard deviations.
+    assert (np.abs(fit.center[0] - shift) < 5.0 * fit.center_error[0] + 0.01).all()
+    assert fit.background[0] == pytest.approx(30.0, abs=5.0 * np.sqrt(SKY / fit.n_pixels[0]))
+    np.testing.assert_allclose(fit.background_slope[0], slope, atol=0.03)
+    # Less than half of the stamp, and all of the donut's light.
+    assert 0.2 * image.size < fit.n_pixels[0] < 0.5 * image.size
+    assert clean[fit.used[0]].sum() > 0.999 * clean.sum()
+    assert np.isfinite(fit.model[0][fit.used[0]]).all()
+    assert np.isnan(fit.model[0][0, 0])
+    pull = (fit.residuals[0] / np.sqrt(SKY + np.maximum(fit.model[0], 0.0)))[fit.used[0]]
+    assert (pull**2).mean() == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / pull.size))

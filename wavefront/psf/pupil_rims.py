@@ -28,7 +28,7 @@ from ..pupil_polynomials import PupilPolynomials
 from .clear_pupil import clear_edges
 
 #: Pieces of each rim: two pixels of a donut of 120.
-_PIECES = 192
+PIECES = 192
 # Frequencies at a time: their strips stay in the processor's cache.
 _CHUNK = 256
 
@@ -45,11 +45,14 @@ class PupilRims:
         Unit vectors towards the lit side.
     parts : ndarray, shape [n]
         Lengths of the pieces over the area of the clear pupil [1/m].
+    pieces : int
+        Pieces that each rim was divided into, dark ones among them.
     """
 
     points: np.ndarray
     normals: np.ndarray
     parts: np.ndarray
+    pieces: int = PIECES
 
     def landing(self, smooth: PupilPolynomials, landing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return where light of the pieces lands [m], and the change of that per metre along the normals, both [n, 2].
@@ -118,12 +121,12 @@ def strip_overlap(baseline: np.ndarray, diameter: float, obscuration: float) -> 
     return np.asarray(diffraction_otf(ring, diameter, obscuration) / (1.0 - 2.0 * ring / (math.pi * width)))
 
 
-def pupil_rims(telescope: Telescope, direction: np.ndarray, wavelength: float) -> PupilRims:
-    """Return the rims of the clear pupil for light of one direction [3]; those of discs and rings alone.
+def pupil_rims(telescope: Telescope, direction: np.ndarray, wavelength: float, pieces: int = PIECES) -> PupilRims:
+    """Return the rims of the clear pupil for light of one direction [3]; discs and rings alone, in so many pieces.
 
     Spiders, and apertures of other shapes, are left out.
     """
-    angle = 2.0 * math.pi * (np.arange(_PIECES) + 0.5) / _PIECES
+    angle = 2.0 * math.pi * (np.arange(pieces) + 0.5) / pieces
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     edges = clear_edges(_annular_apertures_only(telescope), direction[None], unit, wavelength, threads=1)[0]
     area, points, normals, parts = 0.0, [], [], []
@@ -140,7 +143,7 @@ def pupil_rims(telescope: Telescope, direction: np.ndarray, wavelength: float) -
         points.append(rim[shining])
         normals.append(sign * across)
         parts.append(length[shining])
-    return PupilRims(np.concatenate(points), np.concatenate(normals), np.concatenate(parts) / max(area, 1e-300))
+    return PupilRims(np.concatenate(points), np.concatenate(normals), np.concatenate(parts) / max(area, 1e-300), pieces)
 
 
 def _annular_apertures_only(telescope: Telescope) -> Telescope:
