@@ -8,13 +8,22 @@ from typing import Any
 
 import numpy as np
 from bokeh.core.properties import value
-from bokeh.models import ColumnDataSource, CrosshairTool, HoverTool, Span
+from bokeh.models import (
+    ColumnDataSource,
+    CrosshairTool,
+    CustomJSTickFormatter,
+    FixedTicker,
+    HoverTool,
+    Span,
+)
 
 from .design_views import CorrelationView, Line, MtfView, SensitivityView, projected
 from .pictures import BLUE, GREEN, GREY, ORANGE, THEMES, Picture
 
 #: Bars of sensitivities at most.
 _MOST_BARS = 16
+#: Range of a logarithmic axis from which its labels are powers of ten alone.
+_WIDE = 100.0
 
 
 class MtfPicture(Picture):
@@ -50,6 +59,10 @@ class MtfPicture(Picture):
         self.figure.legend.items[-1].visible = reference is not None
 
 
+def _log_ticks(low: int, high: int, mantissas: Sequence[int]) -> list[float]:
+    return [float(f"{mantissa}e{power}") for power in range(low, high) for mantissa in mantissas]
+
+
 class WhiskerCorrelationPicture(Picture):
     """xi+ of the whiskers, of those of the state that is compared to, and of the change between both."""
 
@@ -68,6 +81,8 @@ class WhiskerCorrelationPicture(Picture):
             marks = {"line_color": color, "fill_color": color, "fill_alpha": "alpha", "size": 8, "line_width": 1.5}
             self.figure.scatter("r", "size", marker=marker, **marks, **style)
         self.figure.legend.location = "bottom_left"
+        self.figure.xaxis.ticker = FixedTicker(ticks=_log_ticks(-2, 5, (1, 2, 5)))
+        self.figure.yaxis.formatter = CustomJSTickFormatter(code="return tick.toExponential(0)")
         scatters = [renderer for renderer in self.figure.renderers if "fill_alpha" in renderer.glyph.properties()]
         tips = [("separation", "@r{0.0} arcmin"), ("xi+", "@xi")]
         self.figure.add_tools(HoverTool(renderers=scatters, tooltips=tips))

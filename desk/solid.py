@@ -5,12 +5,15 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable
 
+import numpy as np
 from bokeh.layouts import row
 from bokeh.models import Button, CustomJS, Row, TextAreaInput
 from trimesh.viewer import scene_to_html
 
 from ..design.layout.layout import Layout
 
+#: Light of the surfaces themselves in the viewer, over their colour.
+_GLOW = 0.3
 #: Shows a page in a frame above the desk, which scripts of the frame cannot reach.
 _OPEN = """
 if (!text.value) return;
@@ -47,8 +50,10 @@ def solid_page(drawing: Layout) -> str:
     """Return a page of trimesh's viewer, which holds three.js and the meshes of a layout."""
     scene = drawing.scene()
     for mesh in scene.geometry.values():
-        # The viewer has no surroundings that metal would mirror.
-        mesh.visual.material.metallicFactor = 0.0
+        material = mesh.visual.material
+        # The viewer has no surroundings that metal would mirror, and light from the observer alone.
+        material.metallicFactor = 0.0
+        material.emissiveFactor = _GLOW * np.array(material.baseColorFactor[:3]) / 255.0
     return str(scene_to_html(scene))
 
 
