@@ -162,7 +162,8 @@ def test_the_correlation_follows_a_slider_and_the_solid_stands_in_a_frame(new_pa
     slider = page.get_by_role("slider").first
     slider.focus()
     slider.press("PageUp")
-    page.wait_for_function(f"name => !({TEXT})().includes(name + '</div><b style=\"font-size:17px\">0<')", arg=change)
+    moved = f"name => !({TEXT})().includes(name + '</div><b style=\"font-size:17px\">0<')"
+    page.wait_for_function(moved, arg=change, timeout=PATIENCE)
     assert float(shown(page)[change]) > 0
     page.get_by_label("Three dimensions").check()
     page.get_by_role("button", name="Solid").click()
