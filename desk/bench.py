@@ -144,7 +144,7 @@ class Bench:
         sliders = []
         for term in TERMS:
             unit, high = ("urad" if term == "tilt" else "um"), _TIMES * 1e6 * getattr(SIMULATED, BUDGET_KEYS[term])
-            label = f"{_HEIGHT_LABELS[term]}, peak to valley"
+            label = f"{_HEIGHT_LABELS[term]}, PV"
             sliders.append(Control(f"heights.{term}", label, unit, "Heights of CCDs", 0.0, high, high / 100.0))
         return sliders
 

@@ -1,4 +1,4 @@
-"""Pictures of a design: modulation transfer, sensitivities, the course of an optimisation, three dimensions."""
+"""Pictures of a design: modulation transfer, xi+, sensitivities, the course of an optimisation, three dimensions."""
 
 from __future__ import annotations
 
@@ -7,13 +7,23 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColumnDataSource, CrosshairTool, HoverTool, Span
+from bokeh.core.properties import value
+from bokeh.models import (
+    ColumnDataSource,
+    CrosshairTool,
+    CustomJSTickFormatter,
+    FixedTicker,
+    HoverTool,
+    Span,
+)
 
-from .design_views import Line, MtfView, SensitivityView, projected
+from .design_views import CorrelationView, Line, MtfView, SensitivityView, projected
 from .pictures import BLUE, GREEN, GREY, ORANGE, THEMES, Picture
 
 #: Bars of sensitivities at most.
 _MOST_BARS = 16
+#: Range of a logarithmic axis from which its labels are powers of ten alone.
+_WIDE = 100.0
 
 
 class MtfPicture(Picture):
@@ -47,6 +57,54 @@ class MtfPicture(Picture):
             "t": none if reference is None else reference.tangential,
         }
         self.figure.legend.items[-1].visible = reference is not None
+
+
+def _log_ticks(low: int, high: int, mantissas: Sequence[int]) -> list[float]:
+    return [float(f"{mantissa}e{power}") for power in range(low, high) for mantissa in mantissas]
+
+
+class WhiskerCorrelationPicture(Picture):
+    """xi+ of the whiskers, of those of the state that is compared to, and of the change between both."""
+
+    def __init__(self) -> None:
+        axes = ("separation [arcmin]", "|xi+| of e, hollow where negative")
+        super().__init__("xi", "Correlation", *axes, square=False, log_x=True, log_y=True)
+        self.sources: dict[str, ColumnDataSource] = {}
+        for name, color, dash, marker in (
+            ("reference", ORANGE, "dashed", "diamond"),
+            ("change", GREEN, "dotted", "square"),
+            ("xi_plus", BLUE, "solid", "circle"),
+        ):
+            self.sources[name] = ColumnDataSource({"r": [], "size": [], "xi": [], "alpha": []})
+            style = {"source": self.sources[name], "legend_label": name}
+            self.figure.line("r", "size", color=color, line_dash=dash, line_width=1.5, **style)
+            marks = {"line_color": color, "fill_color": color, "fill_alpha": "alpha", "size": 8, "line_width": 1.5}
+            self.figure.scatter("r", "size", marker=marker, **marks, **style)
+        self.figure.legend.location = "bottom_left"
+        self.figure.xaxis.ticker = FixedTicker(ticks=_log_ticks(-2, 5, (1, 2, 5)))
+        self.figure.yaxis.formatter = CustomJSTickFormatter(code="return tick.toExponential(0)")
+        scatters = [renderer for renderer in self.figure.renderers if "fill_alpha" in renderer.glyph.properties()]
+        tips = [("separation", "@r{0.0} arcmin"), ("xi+", "@xi")]
+        self.figure.add_tools(HoverTool(renderers=scatters, tooltips=tips))
+
+    def show(self, view: CorrelationView) -> None:
+        """Draw the curves; bins without pairs are left out."""
+        for name, source in self.sources.items():
+            xi = getattr(view, name)
+            # A state beside itself has no change, and a logarithm none of zero.
+            drawn = np.isfinite(xi) & (xi != 0.0)
+            xi = xi[drawn]
+            alpha = np.where(xi > 0, 0.9, 0.0)
+            source.data = {
+                "r": view.r_arcmin[drawn],
+                "size": np.abs(xi),
+                "xi": [f"{v:.3g}" for v in xi],
+                "alpha": alpha,
+            }
+        labels = (view.against, f"change from {view.against}", "now")
+        for item, label in zip(self.figure.legend.items, labels, strict=True):
+            item.label = value(label)
+        self.figure.title.text = f"Correlation of {view.count} whiskers"
 
 
 class SensitivityPicture(Picture):

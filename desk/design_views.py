@@ -1,4 +1,4 @@
-"""Views that are computed where they are wanted: MTF, sensitivities, three dimensions, better states."""
+"""Views that are computed where they are wanted: MTF, xi+, sensitivities, three dimensions, better states."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
 
 from ..core.errors import PachonError, check_choice
 from ..design.images.mtf import mtf
@@ -15,18 +16,22 @@ from ..design.layout.sections import surface_lines
 from ..design.optimize.jacobian import ParameterColumns
 from ..design.optimize.merit import Beams, SpotMerit
 from ..design.optimize.sensitivity import sensitivity
+from ..measure.correlation import SeparationBins, shear_correlation
 from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ..models.paraxial import following_stop
 from ..wavefront.chief_rays import reference_rays
 from ..wavefront.request import Request
 from .state import DeskState
-from .views import JMAX, RINGS, Scene
+from .views import JMAX, RINGS, Scene, WhiskersView
 
 #: Metrics of the sensitivities.
 WAVEFRONT, SPOTS = f"rms of Z4 to Z{JMAX} at the star", "rms spot radius over the field"
 METRICS = (WAVEFRONT, SPOTS, *(f"Z{j} at the star" for j in range(4, 12)))
 #: Evaluations of the merit between two pictures of an optimisation.
 _EVALUATIONS = 4
+#: Whiskers on a CCD for a correlation, and its bins of separation.
+PER_CCD = 10
+_BINS = 10
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,44 @@ def mtf_view(scene: Scene) -> MtfView:
     result = mtf(Request.of(scene.telescope, scene.field[None], scene.wavelength).on(scene.focal_plane))
     limit = 0.5 * (result.tangential_limit[0] + result.sagittal_limit[0])
     return MtfView(result.frequency * 1e-3, result.tangential[0], result.sagittal[0], limit)
+
+
+@dataclass(frozen=True)
+class CorrelationView:
+    """Correlation function xi+ of the ellipticities (a - b) / (a + b) of whiskers; NaN in bins without pairs."""
+
+    r_arcmin: np.ndarray  #: mean separation of the pairs [arcmin], [n]
+    xi_plus: np.ndarray  #: of the state, [n]
+    reference: np.ndarray  #: of the state that it is compared to, [n]
+    change: np.ndarray  #: of the differences of ellipticity between both, star by star, [n]
+    against: str  #: the state that it is compared to, in words
+    count: int  #: of whiskers
+
+    @property
+    def numbers(self) -> dict[str, tuple[float, str]]:
+        """The values at the shortest separation, with their units."""
+        at = f"at {self.r_arcmin[0]:.2g} arcmin"
+        return {
+            f"xi+ of e {at}": (float(self.xi_plus[0]), ""),
+            f"xi+ of its change from {self.against} {at}": (float(self.change[0]), ""),
+        }
+
+
+def separation_bins(fields: np.ndarray) -> SeparationBins:
+    """Return bins from the least separation of field angles [rad], shape [n, 2], to the diameter of the field."""
+    nearest = cKDTree(fields).query(fields, k=2)[0][:, 1]
+    # A pair at the end of a bin may round out of it.
+    return SeparationBins(0.9 * float(nearest.min()), 2.01 * float(np.hypot(*fields.T).max()), _BINS, exact=False)
+
+
+def correlation_view(
+    fields: np.ndarray, bins: SeparationBins, now: WhiskersView, reference: WhiskersView, against: str
+) -> CorrelationView:
+    """Return the correlations of whiskers at field angles [rad], shape [n, 2], of a state and of another one."""
+    x, y = fields.T
+    shapes = ((now.e1, now.e2), (reference.e1, reference.e2), (now.e1 - reference.e1, now.e2 - reference.e2))
+    state, compared, change = (shear_correlation(x, y, e1, e2, bins=bins) for e1, e2 in shapes)
+    return CorrelationView(state.r_arcmin, state.xi_plus, compared.xi_plus, change.xi_plus, against, len(x))
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,12 +13,28 @@ from bokeh.layouts import row
 from bokeh.models import Button, MultiSelect, Select, Slider
 
 from ..core.errors import PachonError
+from ..design.layout.layout import Layout
+from ..measure.correlation import SeparationBins
 from .bench import Bench
-from .design_pictures import MeritPicture, MtfPicture, SensitivityPicture, SpacePicture
-from .design_views import METRICS, Line, MtfView, SensitivityView, improved, mtf_view, sensitivity_view, space_view
+from .design_pictures import MeritPicture, MtfPicture, SensitivityPicture, SpacePicture, WhiskerCorrelationPicture
+from .design_views import (
+    METRICS,
+    PER_CCD,
+    CorrelationView,
+    Line,
+    MtfView,
+    SensitivityView,
+    correlation_view,
+    improved,
+    mtf_view,
+    sensitivity_view,
+    separation_bins,
+    space_view,
+)
 from .pictures import OpdPicture, Picture, SpotsPicture, WhiskersPicture
+from .solid import solid_buttons
 from .state import DeskState
-from .views import HeightsView, OpdView, Scene, SpotsView, WhiskersView, layout_of
+from .views import HeightsView, OpdView, Scene, SpotsView, WhiskersView, layout_of, whiskers_view
 
 #: Views by their class.
 Views = Mapping[type, Any]
@@ -25,6 +43,8 @@ _SETTLED = 1e-5
 _MOST_STEPS = 60
 #: Variables that are listed at once.
 _LISTED = 6
+#: Whiskers that a correlation keeps: of the state, the design and A, one and ten a CCD.
+_KEPT = 6
 
 
 class Panel(ABC):
@@ -42,6 +62,14 @@ class Panel(ABC):
         self.shown = shown
         for part in (*(picture.figure for picture in self.pictures), *self.widgets):
             part.visible = shown
+
+    @property
+    def numbers(self) -> dict[str, tuple[float, str]]:
+        """Numbers beside those of the desk, with their units; none by default."""
+        return {}
+
+    def draw_fast(self, scene: Scene, views: dict[type, Any], compared: Views) -> None:  # noqa: B027 - optional
+        """Draw what follows a slider; nothing by default."""
 
     @abstractmethod
     def draw(self, scene: Scene, views: dict[type, Any], compared: Views) -> None:
@@ -62,6 +90,62 @@ class MtfPanel(Panel):
         """Draw the curves of the state, and that of the pinned one."""
         views[MtfView] = mtf_view(scene)
         self.picture.show(views[MtfView], compared.get(MtfView))
+
+
+class CorrelationPanel(Panel):
+    """xi+ of the whiskers beside that of the pinned state or, where there is none, of the design."""
+
+    label = "Correlation"
+
+    def __init__(self, bench: Bench, pinned: Callable[[], DeskState]) -> None:
+        super().__init__()
+        self._bench, self._pinned = bench, pinned
+        self.picture = WhiskerCorrelationPicture()
+        self.pictures = (self.picture,)
+        self.view: CorrelationView | None = None
+        self._kept: list[tuple[DeskState, int, WhiskersView]] = []
+
+    @property
+    def numbers(self) -> dict[str, tuple[float, str]]:
+        """The values at the shortest separation."""
+        return {} if self.view is None else self.view.numbers
+
+    @cached_property
+    def _bins(self) -> SeparationBins:
+        return separation_bins(self._bench.stars(PER_CCD)[1])
+
+    def draw_fast(self, scene: Scene, views: dict[type, Any], compared: Views) -> None:
+        """Draw separations of CCDs, by the whiskers that are drawn already."""
+        if WhiskersView in views:
+            self.picture.show(self._view(scene, views[WhiskersView], bool(compared)))
+
+    def draw(self, scene: Scene, views: dict[type, Any], compared: Views) -> None:
+        """Draw all separations, by ten whiskers a CCD."""
+        drawn = views.get(WhiskersView)
+        fine = drawn if drawn is not None and self._per_ccd(drawn) == PER_CCD else self._whiskers(scene.state, PER_CCD)
+        self.view = self._view(scene, fine, bool(compared))
+        self.picture.show(self.view)
+
+    def _per_ccd(self, whiskers: WhiskersView) -> int:
+        return PER_CCD if len(whiskers.e1) == len(self._bench.stars(PER_CCD)[0]) else 1
+
+    def _view(self, scene: Scene, now: WhiskersView, is_pinned: bool) -> CorrelationView:
+        light = {name: getattr(scene.state, name) for name in ("wavelength_nm", "seeing_arcsec")}
+        compared = self._pinned() if is_pinned else replace(self._bench.start, **light)
+        per_ccd = self._per_ccd(now)
+        reference, against = self._whiskers(compared, per_ccd), "A" if is_pinned else "the design"
+        return correlation_view(self._bench.stars(per_ccd)[1], self._bins, now, reference, against)
+
+    def _whiskers(self, state: DeskState, per_ccd: int) -> WhiskersView:
+        """Return the whiskers of a state, computed once for each."""
+        # They do not depend on the field of the star.
+        state = replace(state, field_deg=(0.0, 0.0))
+        view = next((w for s, n, w in self._kept if (s, n) == (state, per_ccd)), None)
+        if view is None:
+            view = whiskers_view(Scene.of(self._bench, state), per_ccd)
+        self._kept = [kept for kept in self._kept if kept[2] is not view][1 - _KEPT :]
+        self._kept.append((state, per_ccd, view))
+        return view
 
 
 class SensitivityPanel(Panel):
@@ -89,17 +173,17 @@ class SpacePanel(Panel):
 
     label = "Three dimensions"
 
-    def __init__(self) -> None:
+    def __init__(self, drawing: Callable[[], Layout]) -> None:
         super().__init__()
         self.picture = SpacePicture()
         self.pictures = (self.picture,)
         self._lines: tuple[Line, ...] = ()
         self.azimuth = Slider(title="View from azimuth [deg]", start=-180, end=180, step=5, value=30)
         self.elevation = Slider(title="View from elevation [deg]", start=-90, end=90, step=5, value=20)
-        self.widgets = (self.azimuth, self.elevation)
-        for slider in self.widgets:
+        for slider in (self.azimuth, self.elevation):
             slider.sizing_mode = "stretch_width"
             slider.on_change("value", lambda attribute, old, new: self._show())
+        self.widgets = (self.azimuth, self.elevation, solid_buttons(drawing))
 
     def draw(self, scene: Scene, views: dict[type, Any], compared: Views) -> None:
         """Draw the telescope of the state."""

@@ -38,7 +38,15 @@ class Picture:
     """A figure, and the state of a theme."""
 
     def __init__(
-        self, name: str, title: str, x_label: str, y_label: str, *, square: bool = True, log_x: bool = False
+        self,
+        name: str,
+        title: str,
+        x_label: str,
+        y_label: str,
+        *,
+        square: bool = True,
+        log_x: bool = False,
+        log_y: bool = False,
     ) -> None:
         self.figure = figure(
             name=name,
@@ -49,6 +57,7 @@ class Picture:
             active_scroll=None,
             match_aspect=square,
             x_axis_type="log" if log_x else "linear",
+            y_axis_type="log" if log_y else "linear",
             x_axis_label=x_label,
             y_axis_label=y_label,
             min_border=4,

@@ -35,7 +35,8 @@ def open_server(show: Callable[[Document], None], port: int = PORT, token: str |
     for name, level in {"bokeh": logging.ERROR, "bokeh.server.views.ws": logging.CRITICAL}.items():
         logging.getLogger(name).setLevel(level)
     logging.getLogger("tornado.access").setLevel(logging.ERROR)
-    logging.getLogger("tornado.application").addFilter(_is_no_early_farewell)
+    for name in ("tornado.application", "bokeh.server.protocol_handler"):
+        logging.getLogger(name).addFilter(_is_no_early_farewell)
     for number in range(port, min(port + _PORTS, 65536)):
         try:
             server = Server(
@@ -69,5 +70,5 @@ def serve(server: Server, address: str, *, browser: bool) -> None:
 
 
 def _is_no_early_farewell(record: logging.LogRecord) -> bool:
-    """Leave out Bokeh's assertion about a page that is closed before it has opened its session."""
+    """Leave out Bokeh's assertions about a page that is closed while messages of it are on their way."""
     return not (record.exc_info and record.exc_info[0] is AssertionError)

@@ -26,7 +26,7 @@ from bokeh.models import (
 from ..core.errors import PachonError
 from .bench import Bench, Control
 from .page_session import PageSession
-from .panels import BesidePanel, MtfPanel, OptimizePanel, Panel, SensitivityPanel, SpacePanel
+from .panels import BesidePanel, CorrelationPanel, MtfPanel, OptimizePanel, Panel, SensitivityPanel, SpacePanel
 from .pictures import (
     BACKGROUNDS,
     EnergyPicture,
@@ -121,7 +121,11 @@ class Session(PageSession):
         self.beside = BesidePanel(self.bench, new_whiskers)
         self.optimization = OptimizePanel(self.bench, lambda: self.scene, self.change, self._defer, self._say)
         sensitivity = SensitivityPanel(lambda: self._draw_panel(sensitivity))
-        self.panels: tuple[Panel, ...] = (self.beside, MtfPanel(), sensitivity, self.optimization, SpacePanel())
+        space = SpacePanel(lambda: layout_of(self.scene))
+        panels: list[Panel] = [self.beside, MtfPanel(), sensitivity, self.optimization, space]
+        if camera is not None:
+            panels.insert(1, CorrelationPanel(self.bench, lambda: self.history.reference))
+        self.panels = tuple(panels)
         now = (self.spots, self.whiskers, self.opd)
         # Each picture of the pinned state stands beside that of the state.
         pairs = [picture for pair in zip(now, self.beside.pictures, strict=True) for picture in pair]
@@ -323,10 +327,10 @@ class Session(PageSession):
             self.pin()
         self.schedule()
 
-    def _draw_panel(self, panel: Panel) -> None:
+    def _draw_panel(self, panel: Panel, *, fast: bool = False) -> None:
         if panel.shown:
             try:
-                panel.draw(self.scene, self.views, self.compared)
+                (panel.draw_fast if fast else panel.draw)(self.scene, self.views, self.compared)
             except PachonError as error:
                 self._say(error)
 
@@ -402,6 +406,8 @@ class Session(PageSession):
             self.opd.show(self.views[OpdView], self._beside(OpdView))
             self.zernikes.show(self.views[OpdView], self.compared.get(OpdView))
         self._show_whiskers()
+        for panel in self.panels:
+            self._draw_panel(panel, fast=True)
         self._show_numbers()
         self.redraws += 1
 
@@ -450,6 +456,8 @@ class Session(PageSession):
 
     def _show_numbers(self) -> None:
         now, then = (numbers(*(v.get(k) for k in _NUMBERED)) for v in (self.views, self.compared))
+        for panel in self.panels:
+            now |= panel.numbers if panel.shown else {}
         self.table.text = number_boxes(now, then)
 
     def _say(self, message: PachonError | str, *, error: bool = True) -> None:

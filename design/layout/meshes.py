@@ -18,8 +18,8 @@ from .sections import Lens, clear_region
 _RINGS = 24
 #: Points of a surface around the axis.
 _SPOKES = 120
-#: Diameter of the tubes of rays over the largest extent of the telescope.
-_RAY = 6e-4
+#: Diameter of the tubes of rays over the largest extent of the telescope: over a pixel of a screen.
+_RAY = 1.5e-3
 #: Sides of the tubes of rays.
 _SIDES = 5
 #: Colours with opacity, how metallic and how rough.

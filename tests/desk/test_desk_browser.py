@@ -153,6 +153,30 @@ def test_a_slider_gives_the_numbers_of_the_python_api_and_tabs_do_not_mix(new_pa
     wait_for(first, start)
 
 
+def test_the_correlation_follows_a_slider_and_the_solid_stands_in_a_frame(new_page):
+    page = new_page()
+    page.get_by_label("Correlation").check()
+    change = "xi+ of its change from the design at 2.8 arcmin"
+    page.wait_for_function(f"({TEXT})().includes('{change}')", timeout=PATIENCE)
+    assert shown(page)[change] == "0"
+    slider = page.get_by_role("slider").first
+    slider.focus()
+    slider.press("PageUp")
+    moved = f"name => !({TEXT})().includes(name + '</div><b style=\"font-size:17px\">0<')"
+    page.wait_for_function(moved, arg=change, timeout=PATIENCE)
+    assert float(shown(page)[change]) > 0
+    page.get_by_label("Three dimensions").check()
+    page.get_by_role("button", name="Solid").click()
+    frame = page.frame_locator("dialog iframe")
+    frame.locator("#container").wait_for(state="attached", timeout=PATIENCE)
+    # Without a graphics card there may be no WebGL, and the frame stays empty.
+    page.get_by_role("button", name="Close").click()
+    assert page.locator("dialog").count() == 0
+    with page.expect_download(timeout=PATIENCE) as download:
+        page.get_by_role("button", name="Save GLB").click()
+    assert Path(download.value.path()).read_bytes()[:4] == b"glTF"
+
+
 def test_what_is_impossible_is_one_line_and_the_last_good_state_stays(new_page):
     page = new_page()
     before = shown(page)

@@ -1,4 +1,4 @@
-"""Pictures of a design on the desk: MTF, sensitivities, optimisation, three dimensions, the pinned state beside."""
+"""Pictures of a design on the desk: MTF, xi+, sensitivities, optimisation, three dimensions, A beside now."""
 
 from dataclasses import replace
 
@@ -8,7 +8,15 @@ import pytest
 import pachon
 from pachon.core.errors import PachonError
 from pachon.desk.bench import Bench
-from pachon.desk.design_views import METRICS, improved, mtf_view, projected, sensitivity_view, space_view
+from pachon.desk.design_views import (
+    METRICS,
+    improved,
+    mtf_view,
+    projected,
+    sensitivity_view,
+    separation_bins,
+    space_view,
+)
 from pachon.desk.views import Scene, layout_of, opd_view, spots_view
 
 BENCH = Bench("lsst_v3.3_r")
@@ -31,6 +39,8 @@ def test_sensitivities_are_differences_of_the_metric(metric):
         assert view.effect[index] == pytest.approx(view.derivative[index] * control.step)
 
 
+#: Terms of the heights beside the potato chip.
+OTHERS = ("global", "raft", "ccd", "tilt")
 #: All rafts 20 um above the detector.
 LIFTED = dict.fromkeys(BENCH.camera.raft_names, 20.0)
 
@@ -101,6 +111,40 @@ def test_lines_lie_on_the_surfaces_within_their_apertures():
     np.testing.assert_allclose(z, surface.shape.sag(x, y), atol=1e-12)
     assert np.hypot(x, y).min() >= surface.aperture.inner
     assert {line.kind for line in lines} >= {"ray", "mirror", "refract", "detector"}
+
+
+@pytest.mark.long
+def test_the_potato_chip_is_felt_in_the_correlation_that_the_python_api_gives():
+    pytest.importorskip("bokeh", reason="a desk needs Bokeh: pip install 'pachon[desk]'")
+    from pachon.desk.panels import CorrelationPanel
+
+    panel = CorrelationPanel(BENCH, lambda: BENCH.start)
+    drawn = {}
+    for size in (10.0, 20.0):
+        panel.draw(Scene.of(BENCH, replace(BENCH.start, heights={"potato_chip": size})), {}, {})
+        drawn[size] = panel.view
+    fields = BENCH.stars(10)[1]
+    # Table 1's simulated potato chip is 5 um; the seeing is 0.6 arcsec at 500 nm.
+    plane = pachon.FocalPlane.from_budget("lsst", seed=1).scaled({"potato_chip": 4.0} | dict.fromkeys(OTHERS, 0.0))
+    atmosphere = pachon.Atmosphere.from_site("cerro_pachon", 1, r0=0.9759 * 500e-9 / np.deg2rad(0.6 / 3600.0))
+    wavelength = BENCH.start.wavelength_nm * 1e-9
+    xi = []
+    for heights in (None, plane):
+        options = {"focal_plane": heights, "atmosphere": atmosphere, "stamps": pachon.Stamps(size=27)}
+        moments = pachon.psf_moments(BENCH.nominal, fields, wavelength, **options)
+        xi.append((moments.g1, moments.g2))
+    view, bins = drawn[20.0], separation_bins(fields)
+    flat, now = np.array(xi)
+    for value, shapes in ((view.reference, flat), (view.xi_plus, now), (view.change, now - flat)):
+        expected = pachon.shear_correlation(*fields.T, *shapes, bins=bins)
+        # The Fried parameter has four digits; TreeCorr keeps single precision.
+        np.testing.assert_allclose(value, expected.xi_plus, rtol=1e-3, atol=1e-5 * np.abs(expected.xi_plus).max())
+    np.testing.assert_allclose(view.r_arcmin, expected.r_arcmin)
+    # Defocus on astigmatism: ellipticities grow with heights, xi+ with their square; one to two waves on a CCD of 13
+    # arcmin are the same within 3 arcmin and opposite at twice that.
+    assert view.change[0] == pytest.approx(4.0 * drawn[10.0].change[0], rel=0.05)
+    assert view.change[1] < -0.5 * view.change[0] < 0.0
+    assert np.abs(view.change[3:]).max() < 0.1 * view.change[0]
 
 
 @pytest.mark.long
