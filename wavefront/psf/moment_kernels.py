@@ -116,10 +116,10 @@ def measure_spectra(
     """Measure moments of one star under a Gaussian weight about its centroid, round or as elliptical as the image.
 
     Lengths are in units of the period over 2 pi. Arguments: spectrum and detector as those of ``sample_pixels``; start
-    [star, 5]: centroid of the first weight, and its moments xx, yy, xy; most_steps, tolerance of the centroid and of the moments' square root, as
-    a part of the weight's width; ellipse [star, ELLIPSE]: centroid, central moments xx, yy, xy under the weight or,
-    where it is adaptive, of the weight itself, and the weighted total; flags [star]: 1 where the iteration has not
-    converged, 2 where moments are not positive, 8 where there is no light.
+    [star, 5]: centroid of the first weight, and its moments xx, yy, xy; most_steps, tolerance of the centroid and of
+    the moments' square root, as a part of the weight's width; ellipse [star, ELLIPSE]: centroid, central moments xx,
+    yy, xy under the weight or, where it is adaptive, of the weight itself, and the weighted total; flags [star]: 1
+    where the iteration has not converged, 2 where moments are not positive, 8 where there is no light.
     """
     star = first + wp.tid()
     zero = wp.float64(0.0)
