@@ -134,7 +134,10 @@ def moment_spectrum(
     radius = unit * np.expm1(step * np.arange(_RINGS))
     angle = math.pi * np.arange(_SPOKES) / _SPOKES
     lags = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    polar = moment_covariance(air, lags).total(response).reshape(_RINGS, _SPOKES, 6)
+    # The first ring is the lag zero.
+    lags = np.concatenate([lags[0, :1], lags[1:].reshape(-1, 2)])
+    covariances = moment_covariance(air, lags).total(response)
+    polar = np.concatenate([np.repeat(covariances[:1], _SPOKES, axis=0), covariances[1:]]).reshape(_RINGS, _SPOKES, 6)
     # What stars half a period apart share, all stars do.
     shared = _positive(as_matrices(polar[np.searchsorted(radius, 0.5 * grid.side)].mean(axis=0)))
     scale = float(polar[0, 0, 2])
@@ -239,7 +242,9 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
     scale = 1e6 * math.sqrt(float(path_spectrum(0.0, air.r0, air.outer_scale)) * air.outer_scale ** (-11.0 / 3.0))
     weights = np.array([air.weights[n] for n in layers])
     drift = air.exposure * np.array([air.velocities[n] for n in layers])
-    radial = np.array([radial_transform(j, _HIGHEST, _TABLE, air.obscuration) for j in NOLL])
+    nu = np.linspace(0.0, _HIGHEST / air.diameter, _TABLE)
+    root = (nu**2 + air.outer_scale**-2) ** (-11.0 / 12.0)
+    radial = np.array([root * radial_transform(j, _HIGHEST, _TABLE, air.obscuration) for j in NOLL])
     spectrum = np.empty((len(NOLL), size, size // 2 + 1), dtype=np.complex64)
     launch(
         add_wavefronts,
@@ -249,7 +254,6 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
             warp_array(distance, wp.float32),
             warp_array(drift, wp.float32),
             warp_array(scale * size * np.sqrt(weights) / (distance * side), wp.float32),
-            1.0 / air.outer_scale,
             1.0 / side,
             warp_array(radial.T, zernikes),
             air.diameter * (_TABLE - 1) / _HIGHEST,
@@ -257,6 +261,5 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
             warp_array(spectrum, wp.vec2f),
         ],
     )
-    gain = 1e-6 * _spline_gain(size)
-    fields = np.stack([scipy.fft.irfft2(gain * values, s=(size, size)) for values in spectrum])
-    return SplineFields(side, fields.astype(np.float32))
+    spectrum *= np.float32(1e-6) * _spline_gain(size)
+    return SplineFields(side, scipy.fft.irfft2(spectrum, s=(size, size), overwrite_x=True))

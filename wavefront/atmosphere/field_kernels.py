@@ -86,7 +86,6 @@ def add_wavefronts(
     distance: wp.array(dtype=wp.float32),
     drift: wp.array2d(dtype=wp.float32),
     strength: wp.array(dtype=wp.float32),
-    outer_frequency: wp.float32,
     frequency_step: wp.float32,
     radial: wp.array(dtype=zernikes),
     per_frequency: wp.float32,
@@ -97,9 +96,9 @@ def add_wavefronts(
 
     Arguments: noise [layer, row, column]: transform of white noise; distance [layer] along the line of sight [m];
     drift [layer, 2] in the exposure [m]; strength [layer]: amplitude of a mode but for the power of its frequency;
-    outer_frequency: one over the outer scale [1/m]; frequency_step of the field [cycles/rad]; radial [k]: mean
-    over the pupil of a term's radial part times a wave, against the frequency, whose table has per_frequency steps a
-    cycle/m; order [term] m of the Zernikes, negative for sines; spectrum [term, row, column].
+    frequency_step of the field [cycles/rad]; radial [k]: mean over the pupil of a term's radial part times a wave, with
+    the root of the power of the frequency, against the frequency, whose table has per_frequency steps a cycle/m; order
+    [term] m of the Zernikes, negative for sines; spectrum [term, row, column].
     """
     row = first + wp.tid()
     size = spectrum.shape[1]
@@ -122,13 +121,11 @@ def add_wavefronts(
                 if at < last:
                     nu_x = across / distance[layer]
                     nu_y = up / distance[layer]
-                    squared = nu_x * nu_x + nu_y * nu_y
                     turns = wp.float32(wp.PI) * (nu_x * drift[layer, 0] + nu_y * drift[layer, 1])
                     smear = wp.float32(1.0)
                     if wp.abs(turns) > wp.float32(1e-3):
                         smear = wp.sin(turns) / turns
-                    power = wp.pow(squared + outer_frequency * outer_frequency, wp.float32(-11.0 / 12.0))
-                    mode = strength[layer] * power * smear * noise[layer, row, column]
+                    mode = strength[layer] * smear * noise[layer, row, column]
                     knot = wp.int32(at)
                     gain = wp.cw_mul(around, radial[knot] + (at - wp.float32(knot)) * (radial[knot + 1] - radial[knot]))
                     re = re + mode[0] * gain

@@ -71,8 +71,8 @@ def mean_wavefront_covariance(
     slopes = np.atleast_2d(np.asarray(fields, dtype=np.float64))
     low, high, count = _FREQUENCIES
     frequency = np.geomspace(low, high, count) / diameter
-    angle = np.pi * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
-    transform = _zernike_transforms(indices, 0.5 * diameter * frequency, angle, obscuration)
+    angle = _directions()
+    transform = _zernike_transforms(tuple(indices.tolist()), obscuration)
     plane = frequency[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     # The other half of the plane is the complex conjugate.
     area = 2.0 * (np.log(high / low) / (count - 1)) * (np.pi / _DIRECTIONS) * frequency**2
@@ -99,20 +99,26 @@ def mean_wavefront_covariance(
     return covariance
 
 
-def _zernike_transforms(
-    indices: np.ndarray, frequency: np.ndarray, angle: np.ndarray, obscuration: float
-) -> np.ndarray:
-    """Return means over the annulus of Zernikes times a plane wave, shape [n_frequency, n_angle, n_noll].
+@lru_cache(maxsize=2)
+def _zernike_transforms(indices: tuple[int, ...], obscuration: float) -> np.ndarray:
+    """Return means over the annulus of Zernikes times a plane wave, [n_frequency, n_angle, n_noll].
 
-    Frequencies are in cycles per radius of the pupil.
+    They are at the frequencies and directions of :func:`mean_wavefront_covariance`, which are stored, as they do not
+    depend on the atmosphere.
     """
+    frequency, angle = 0.5 * np.geomspace(*_FREQUENCIES), _directions()
     out = np.empty((len(frequency), len(angle), len(indices)), dtype=np.complex128)
     for k, j in enumerate(indices):
-        _, m = noll_to_nm(int(j))
+        _, m = noll_to_nm(j)
         order = abs(m)
         around = np.cos(order * angle) if m >= 0 else np.sin(order * angle)
-        out[:, :, k] = 1j**order * _radial_means(int(j), frequency, obscuration)[:, None] * around
+        out[:, :, k] = 1j**order * _radial_means(j, frequency, obscuration)[:, None] * around
     return out
+
+
+def _directions() -> np.ndarray:
+    """Return the directions of frequencies over half the plane [rad], [n_angle]."""
+    return np.pi * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
 
 
 def _radial_means(noll: int, frequency: np.ndarray, obscuration: float) -> np.ndarray:

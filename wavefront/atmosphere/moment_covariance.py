@@ -156,8 +156,9 @@ def moment_covariance(air: ExposedAir, lags: np.ndarray, threads: int | None = N
     """Return the covariances of the moments of two stars whose field slopes are lags [n, 2] [rad] apart."""
     lag, delays = np.asarray(lags, dtype=np.float64).reshape(-1, 2), _Delays.of(air)
     # All stars share the layers on the ground.
-    _, common = _averages(air.on_ground(), np.zeros((1, 2)), delays, np.zeros((0, 12)), threads)
-    squares, slopes = _averages(air, lag, delays, common[0], threads)
+    ground = np.zeros(delays.baseline.shape, dtype=np.float32)
+    _, common = _averages(air.on_ground(), np.zeros((1, 2)), delays, np.zeros((0, 12)), ground, threads)
+    squares, slopes = _averages(air, lag, delays, common[0], ground, threads)
     second = squares[:, :6] - _by_mean_slope(slopes, delays, air.exposure)
     # The fourth powers' own factors: 1/6 of p and q, 1 of s.
     fourth = squares[:, 6:] * np.array([1.0 / 6.0, 1.0 / 6.0, 1.0])
@@ -165,7 +166,7 @@ def moment_covariance(air: ExposedAir, lags: np.ndarray, threads: int | None = N
 
 
 def _averages(
-    air: ExposedAir, lag: np.ndarray, delays: _Delays, common: np.ndarray, threads: int | None
+    air: ExposedAir, lag: np.ndarray, delays: _Delays, common: np.ndarray, ground: np.ndarray, threads: int | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return squares [n_lag, 9] and terms [n_lag, n_delay, 3] in microradians, see :func:`.average_products`.
 
@@ -190,6 +191,7 @@ def _averages(
             1.0 / table.step,
             air.diameter + table.reach,
             warp_array(common),
+            warp_array(ground, baselines),
             warp_array(np.zeros((len(lag), len(air.weights), 3)), wp.float32),
             warp_array(squares),
             warp_array(terms),

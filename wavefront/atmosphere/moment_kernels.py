@@ -45,6 +45,7 @@ def average_products(
     per_step: wp.float32,
     farthest: wp.float64,
     common: wp.array2d(dtype=wp.float64),
+    ground: wp.array2d(dtype=baselines),
     place: wp.array3d(dtype=wp.float32),
     squares: wp.array2d(dtype=wp.float64),
     terms: wp.array3d(dtype=wp.float64),
@@ -55,7 +56,8 @@ def average_products(
     of the packets of each delay; baseline [packet, 3] of the pupil: x, y [m], weight of sum 1; altitude, velocity,
     weight of the layers; table: the slopes' covariance, isotropic and directed, zero at the end; per_step: one over its
     step [1/m]; farthest: distance of a layer's centre from which on none of its baselines is within the table [m];
-    common [delay, 12]: the terms of layers on the ground alone; where it is empty, these are computed too; place [lag,
+    common [delay, 12]: the terms of layers on the ground alone; where it is empty, these are computed too; ground
+    [packet, 3]: covariances a, b, c of these layers, which are computed with the terms, and zero before; place [lag,
     layer, 3]: room; squares [lag, 9]: averages of pp, qq, ss, pq, ps, qs, and of fourth powers: a^4 + c^4 - 2 b^4, the
     same at 45 degrees, (a + c)^4 / 16; terms [lag, delay, 3 or 12]: averages of a, b, c over the baselines, and where
     there is room what the delay adds to the squares. p = xx - yy, q = 2 xy, s = xx + yy.
@@ -68,17 +70,16 @@ def average_products(
     total = product_sums()
     for t in range(delay.shape[0]):
         active = wp.int32(0)
-        high = wp.int32(0)
         for n in range(n_layer):
+            apart = altitude[n] > wp.float64(0.0) or common.shape[0] == 0
             center_x = altitude[n] * lag[item, 0] + velocity[n, 0] * delay[t]
             center_y = altitude[n] * lag[item, 1] + velocity[n, 1] * delay[t]
-            if center_x * center_x + center_y * center_y < farthest * farthest:
+            if apart and center_x * center_x + center_y * center_y < farthest * farthest:
                 place[item, active, 0] = wp.float32(center_x)
                 place[item, active, 1] = wp.float32(center_y)
                 place[item, active, 2] = weight[n]
                 active = active + 1
-                high = wp.where(altitude[n] > wp.float64(0.0), high + 1, high)
-        if high == 0 and common.shape[0] > 0:
+        if active == 0 and common.shape[0] > 0:
             for k in range(9):
                 total[k] = total[k] + common[t, 3 + k]
             for k in range(3):
@@ -97,9 +98,10 @@ def average_products(
             mean_b = baselines()
             mean_c = baselines()
             for packet in range(packet_start[t], packet_start[t + 1]):
-                a = baselines()
-                b = baselines()
-                c = baselines()
+                # Sums, since a load alone would be an alias of the array.
+                a = baselines() + ground[packet, 0]
+                b = baselines() + ground[packet, 1]
+                c = baselines() + ground[packet, 2]
                 for n in range(active):
                     x = baseline[packet, 0] - baselines(place[item, n, 0])
                     y = baseline[packet, 1] - baselines(place[item, n, 1])
@@ -120,6 +122,10 @@ def average_products(
                     a = a + same + difference
                     c = c + same - difference
                     b = b + two * wp.cw_mul(other, wp.cw_mul(x, y))
+                if common.shape[0] == 0:
+                    ground[packet, 0] = a
+                    ground[packet, 1] = b
+                    ground[packet, 2] = c
                 w = baseline[packet, 2]
                 aa = square(a)
                 bb = square(b)

@@ -19,7 +19,8 @@ LARGEST_LOSS = 0.05
 
 def blur_radii(optics: PupilOptics) -> np.ndarray:
     """Return the rms distance of a star's rays from its reference point [m], 0 for a dark star, shape [n_star]."""
-    square = (optics.displacement.astype(np.float64) ** 2).sum(axis=-1)
+    x, y = (optics.displacement[..., axis].astype(np.float64) for axis in (0, 1))
+    square = x**2 + y**2
     total = np.sum(square, axis=(1, 2), where=optics.lit)
     return np.asarray(np.sqrt(total / np.maximum(optics.lit.sum(axis=(1, 2)), 1)))
 
@@ -45,7 +46,10 @@ def sampling_refinement(optics: PupilOptics, neighbour: float, largest: float, r
 def check_stamp(optics: PupilOptics, plane: ImagePlane) -> None:
     """Raise a DomainError if rays of a star fall beside its stamp, where engines alias or lose light."""
     half = 0.5 * plane.side
-    beside = (np.abs(optics.displacement) > half).any(axis=-1) & optics.lit
+    far = np.abs(optics.displacement) > half
+    if not far.any():
+        return
+    beside = far.any(axis=-1) & optics.lit
     lit = optics.lit.sum(axis=(1, 2))
     lost = beside.sum(axis=(1, 2)) / np.maximum(lit, 1)
     if (lost > LARGEST_LOSS).any():

@@ -19,11 +19,14 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import warp as wp
 
 from ...core.errors import DomainError
+from ...core.launch import launch
 from ...core.row_sums import sums_of_products
 from ...core.threads import one_blas_thread
 from ...core.units import field_label
+from ...core.warp_arrays import warp_array
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ...raytrace.aiming import entrance_points
@@ -35,6 +38,7 @@ from ..aberration import ResidualWavefront
 from ..chief_rays import image_jacobians
 from ..pupil_optics import PupilOptics
 from .clear_pupil import EDGE_RINGS, SpokePupil, aperture_distances, edges_of
+from .field_optics_kernels import land_rays
 
 #: Largest error of landing points [m]: a ten-thousandth of a pixel, which moves e by less than 1e-6.
 LANDING_ERROR = 1e-9
@@ -94,25 +98,31 @@ class FieldOptics:
         n_star, n_wave, n_pupil = len(slopes), len(self.wavelengths), len(self.pupil)
         values = sums_of_products(_terms(slopes / self.reach), self.coefficients, threads)
         chief, jacobian, rays, distances = np.split(values, np.cumsum([4, 4, 4 * n_wave * n_pupil]), axis=1)
-        landed, inclined = np.moveaxis(rays.reshape(n_star, 2, n_wave, n_pupil, 2), 1, 0)
         reference, steepness = self._land(fields, chief, focal_plane)
-        # Along each ray from the nominal surface to the tangent plane of the CCD at the reference point.
-        beside = landed + (chief[:, :2] - reference[:, :2])[:, None, None]
-        along_x, along_y = steepness.T[:, :, None, None]
-        rise = reference[:, 2, None, None] + beside[..., 0] * along_x + beside[..., 1] * along_y
-        rise /= 1.0 - inclined[..., 0] * along_x - inclined[..., 1] * along_y
-        displacement = beside + rise[..., None] * inclined
         jacobian = jacobian.reshape(-1, 2, 2)
+        gradient = np.zeros((n_star, n_pupil, 2))
         if aberration is not None:
             gradient = aberration.gradient(self.pupil[:, 0], self.pupil[:, 1], slopes)
-            displacement -= (jacobian[:, None, :, 0] * gradient[..., :1] + jacobian[:, None, :, 1] * gradient[..., 1:])[
-                :, None
-            ]
+        displacement = np.empty((n_star, n_wave, n_pupil, 2), dtype=np.float32)
+        launch(
+            land_rays,
+            n_star,
+            [
+                warp_array(rays.reshape(n_star, 2, n_wave, n_pupil, 2), wp.vec2d),
+                warp_array(chief[:, :2] - reference[:, :2], wp.vec2d),
+                warp_array(reference[:, 2]),
+                warp_array(steepness, wp.vec2d),
+                warp_array(jacobian, wp.mat22d),
+                warp_array(gradient, wp.vec2d),
+                warp_array(displacement, wp.vec2f),
+            ],
+            threads=threads,
+        )
         distances = distances.reshape(n_star, -1, EDGE_RINGS * len(self.unit))
         edges = edges_of(self.telescope, distances, len(self.unit), threads)
         return PupilOptics(
             pupil=self.pupil,
-            displacement=displacement.astype(np.float32),
+            displacement=displacement,
             path=np.broadcast_to(np.nan, (n_star, n_wave, n_pupil)),
             lit=np.repeat(self._lit(edges)[:, None], n_wave, axis=1),
             jacobian=jacobian,

@@ -61,8 +61,11 @@ GRID_MARGIN = 1.25
 # of it: on AuxTel, where 0.04 are left, they are wrong by 1e-3 in e.
 _LARGEST_LEFT = 1e-3
 # Part of the ring that is lit from which on rims cross few spokes. At 8 um of defocus e of the LSST is wrong by 1e-4 at
-# 0.8, by 5e-4 at 0.62, by 1.5e-3 at 0.57 and by 3e-3 at 0.42.
-_LEAST_LIT = 0.6
+# 0.8, by 1e-3 at 0.61.
+_LEAST_LIT = 0.75
+# The same of many spokes, beyond which the lattice stands for them: at 0.55 e of the LSST is wrong by 1e-4, its size by
+# 4e-5; at 0.38 by 3e-4, both.
+_LEAST_LIT_OF_DENSE = 0.5
 # Points on many spokes, and rings.
 _DENSE_POINTS = 768
 _DENSE_RINGS = 6
@@ -126,9 +129,6 @@ class LongExposureRenderer(PsfRenderer):
     #: Largest transfer function of atmosphere and detector at a frequency that is left out; with pixels of 10 um all
     #: make 2e-6 of the peak of the image.
     negligible: ClassVar[float] = 1e-5
-    #: Part of the ring that is lit from which on many spokes stand for the lattice: size is then wrong by up to 3e-4,
-    #: since strips overlap where rims meet.
-    least_lit_of_dense: ClassVar[float] = _LEAST_LIT
 
     def __init__(self, inputs: PsfInputs, options: LongExposureEngine) -> None:
         super().__init__(inputs)
@@ -238,7 +238,7 @@ class LongExposureRenderer(PsfRenderer):
             return self._expose_lattice(stars)
         optics, edges = self._near_optics(stars, self._pupil)
         lit = self._lit_fraction(edges)
-        kinds = np.where(lit < _LEAST_LIT, np.where(lit < self.least_lit_of_dense, _VIGNETTED, _DENSE), _NEAR)
+        kinds = np.where(lit < _LEAST_LIT, np.where(lit < _LEAST_LIT_OF_DENSE, _VIGNETTED, _DENSE), _NEAR)
         if self._options.n_pupil is None:
             rays = self._ray_counts(optics)
             kinds = np.where(rays > 0, rays, kinds)
@@ -379,7 +379,7 @@ class LongExposureRenderer(PsfRenderer):
         channels = self._channels
         n_wave, depths = len(self._wavelengths), channels.depths
         # Place and light of the points, cut and lean of the strips along the rims.
-        shapes = (n_wave * depths, 2, n_point), (n_point,), (2 * pupil.n_spoke, 2), (n_wave, 2 * pupil.n_spoke, 2)
+        shapes = (n_wave * depths, 2, n_point), (n_point,), (2 * pupil.n_spoke, 3), (n_wave, 2 * pupil.n_spoke, 2)
         points = [wp.empty((n_star, *shape), dtype=wp.float32, device="cpu") for shape in shapes]
         launch(
             place_points,

@@ -82,9 +82,9 @@ def place_points(
     chief ray along the detector; dispersion [wave] [rad]; shift [wave, depth]: path in silicon over its index, and its
     mean_shift [wave] [m]; period of the images [m]; area [star]: the clear pupil [m^2]. Results, with points in the
     order of the traced ones and rims as [2, n_spoke]: place [star, wave * n_depth + depth, 2, point] [periods]; light
-    [star, point]: part of the pupil; cut [star, rim, 2]: part of the pupil per metre of wavelength and step of
-    frequency; lean [star, wave, rim, 2]: phase half-way through the part cut off, against the rim, over that part, per
-    step of frequency [rad].
+    [star, point]: part of the pupil; cut [star, rim, 3]: part of the pupil per metre of wavelength and step of
+    frequency, along x and y, and that of both strips of the spoke, at most, over its light; lean [star, wave, rim, 2]:
+    phase half-way through the part cut off, against the rim, over that part, per step of frequency [rad].
     """
     item = first + wp.tid()
     n_spoke = unit.shape[0]
@@ -103,13 +103,15 @@ def place_points(
     clear = span > zero and landed_rays > zero
     # Direction cosines of the light at the image change along the spoke by this per metre.
     turn = -wp.transpose(wp.inverse(jacobian[star])) * unit[spoke]
+    spoke_light = half * span * angle / area[star]
+    swept = zero
     values = ring_values()
     slopes = ring_values()
     for ring in range(n_ring):
         point = ring * n_spoke + spoke
         light[star, point] = wp.float32(0.0)
         if clear:
-            light[star, point] = wp.float32(half * span * angle * quadrature[ring] / area[star])
+            light[star, point] = wp.float32(spoke_light * quadrature[ring])
         at = wp.sqrt(start + span * fraction[ring])
         end = wp.where(ring == 0, 0, 1)
         rim = end * n_spoke + spoke
@@ -150,6 +152,9 @@ def place_points(
         if outermost:
             cut[star, rim, 0] = wp.float32(across[0])
             cut[star, rim, 1] = wp.float32(across[1])
+            swept = swept + wp.length(across)
+    for end in range(2):
+        cut[star, end * n_spoke + spoke, 2] = wp.float32(wp.where(clear, swept / spoke_light, zero))
 
 
 @wp.func
@@ -167,6 +172,15 @@ def magnitudes(values: samples):
     out = samples()
     for i in range(LANES):
         out[i] = wp.abs(values[i])
+    return out
+
+
+@wp.func
+def shortened(width: samples, opposite: samples, whole: wp.float32):
+    """Width of a strip of a spoke whose strips take together at most its whole light, lane by lane."""
+    out = samples()
+    for i in range(LANES):
+        out[i] = width[i] * wp.min(wp.float32(1.0), whole / wp.max(width[i] + opposite[i], wp.float32(1e-20)))
     return out
 
 
@@ -226,6 +240,9 @@ def transform_pupils(
     n_packet = rows.shape[0]
     inner_end = n_spoke
     outer_start = n_point - n_spoke
+    # One over the part of a spoke's light in its outermost points, of Lobatto's rule.
+    n_ring = n_point // n_spoke
+    whole_spoke = wp.float32(n_ring * (n_ring - 1))
     for packet in range(n_packet):
         for row in range(rows[packet]):
             for component in range(4):
@@ -304,7 +321,14 @@ def transform_pupils(
                     lean_x = lean[star, wave, rim, 0] * number
                     lean_y = lean[star, wave, rim, 1] * ky
                     point_light = samples(light[star, point])
+                    opposite = (rim + n_spoke) % (2 * n_spoke)
+                    whole = light[star, point] * whole_spoke
+                    strips_meet = wavelength[wave] * cut[star, rim, 2] * wp.float32(rows[0]) > wp.float32(1.0)
+                    opposite_x = (wavelength[wave] * cut[star, opposite, 0]) * number
+                    opposite_y = wavelength[wave] * cut[star, opposite, 1] * ky
                     width = magnitudes(width_x + samples(width_y))
+                    if strips_meet:
+                        width = shortened(width, magnitudes(opposite_x + samples(opposite_y)), whole)
                     phase = wp.cw_mul(wp.cw_mul(width, width), lean_x + samples(lean_y))
                     inside_light = point_light - width
                     re = cc - ss
@@ -312,6 +336,8 @@ def transform_pupils(
                     re_plus = re_plus + wp.cw_mul(inside_light, re) + wp.cw_mul(phase, im)
                     im_plus = im_plus + wp.cw_mul(inside_light, im) - wp.cw_mul(phase, re)
                     width = magnitudes(width_x - samples(width_y))
+                    if strips_meet:
+                        width = shortened(width, magnitudes(opposite_x - samples(opposite_y)), whole)
                     phase = wp.cw_mul(wp.cw_mul(width, width), lean_x - samples(lean_y))
                     inside_light = point_light - width
                     re = cc + ss

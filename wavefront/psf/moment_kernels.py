@@ -106,7 +106,7 @@ def measure_spectra(
     spectrum: wp.array4d(dtype=samples),
     detector: wp.array3d(dtype=samples),
     rows: wp.array(dtype=wp.int32),
-    start: wp.float64,
+    start: wp.array2d(dtype=wp.float64),
     adaptive: bool,
     most_steps: wp.int32,
     tolerance: wp.float64,
@@ -115,19 +115,19 @@ def measure_spectra(
 ):
     """Measure moments of one star under a Gaussian weight about its centroid, round or as elliptical as the image.
 
-    Lengths are in units of the period over 2 pi. Arguments: spectrum and detector as those of ``sample_pixels``; start:
-    moment along an axis of the round weight; most_steps, tolerance of the centroid and of the moments' square root, as
-    a part of the weight's width; ellipse [star, ELLIPSE]: centroid, central moments xx, yy, xy under the weight or,
-    where it is adaptive, of the weight itself, and the weighted total; flags [star]: 1 where the iteration has not
-    converged, 2 where moments are not positive, 8 where there is no light.
+    Lengths are in units of the period over 2 pi. Arguments: spectrum and detector as those of ``sample_pixels``; start
+    [star, 5]: centroid of the first weight, and its moments xx, yy, xy; most_steps, tolerance of the centroid and of
+    the moments' square root, as a part of the weight's width; ellipse [star, ELLIPSE]: centroid, central moments xx,
+    yy, xy under the weight or, where it is adaptive, of the weight itself, and the weighted total; flags [star]: 1
+    where the iteration has not converged, 2 where moments are not positive, 8 where there is no light.
     """
     star = first + wp.tid()
     zero = wp.float64(0.0)
-    x = zero
-    y = zero
-    xx = start
-    yy = start
-    xy = zero
+    x = start[star, 0]
+    y = start[star, 1]
+    xx = start[star, 2]
+    yy = start[star, 3]
+    xy = start[star, 4]
     flag = wp.int32(1)
     for _ in range(most_steps):
         if flag == 1:

@@ -268,14 +268,21 @@ class _Moments(LongExposureRenderer):
         )
 
     def _sampled(self, spectrum: np.ndarray, offsets: np.ndarray, lit: np.ndarray, points: np.ndarray) -> ExposedStars:
-        values = np.concatenate(
-            [self._measure(spectrum, False), self._measure(spectrum, self._inputs.atmosphere is not None)], axis=1
-        )
+        square = self._weight**2
+        weighted = self._measure(spectrum, np.tile([0.0, 0.0, square, square, 0.0], (len(spectrum), 1)), False)
+        adaptive = weighted
+        if self._inputs.atmosphere is not None:
+            adaptive = self._measure(spectrum, _without_weight(weighted, square), True)
+        values = np.concatenate([weighted, adaptive], axis=1)
         return ExposedStars(lambda shift: values, lit, points)
 
-    def _measure(self, spectrum: np.ndarray, adaptive: bool) -> np.ndarray:
-        """Return ellipses [m] and flags of transfer functions, [n_star, ELLIPSE + 1]."""
+    def _measure(self, spectrum: np.ndarray, start: np.ndarray, adaptive: bool) -> np.ndarray:
+        """Return ellipses [m] and flags of transfer functions, [n_star, ELLIPSE + 1].
+
+        The first weight has the centroid [m] and the moments [m^2] of ``start`` [n_star, 5].
+        """
         unit = self.period / (2.0 * math.pi)
+        scale = np.array([unit, unit, unit**2, unit**2, unit**2, 1.0])
         ellipse, flags = np.zeros((len(spectrum), ELLIPSE)), np.zeros(len(spectrum), dtype=np.int32)
         launch(
             measure_spectra,
@@ -284,7 +291,7 @@ class _Moments(LongExposureRenderer):
                 warp_array(spectrum, samples),
                 warp_array(self._detector, samples),
                 warp_array(self._rows, wp.int32),
-                (self._weight / unit) ** 2,
+                warp_array(start / scale[:5]),
                 adaptive,
                 _MOST_STEPS,
                 _TOLERANCE,
@@ -293,9 +300,23 @@ class _Moments(LongExposureRenderer):
             ],
             threads=self._threads,
         )
-        ellipse[:, :2] *= unit
-        ellipse[:, 2:5] *= unit**2
-        return np.concatenate([ellipse, flags[:, None]], axis=1)
+        return np.concatenate([ellipse * scale, flags[:, None]], axis=1)
+
+
+def _without_weight(weighted: np.ndarray, square: float) -> np.ndarray:
+    """Return centroids and moments [n, 5] of Gaussian images with ellipses under a round weight of a variance [m^2].
+
+    Where an ellipse is flagged, or no Gaussian has it, the weight's own moments take its place.
+    """
+    x, y, xx, yy, xy, _, flags = weighted.T
+    good = (flags == 0.0) & (xx * yy > xy**2)
+    determinant = np.where(good, xx * yy - xy**2, 1.0)
+    along_x, along_y, across = yy / determinant - 1.0 / square, xx / determinant - 1.0 / square, -xy / determinant
+    inverse = along_x * along_y - across**2
+    good &= (along_x > 0.0) & (inverse > 0.0)
+    inverse = np.where(good, inverse, 1.0)
+    image = np.stack([x, y, along_y / inverse, along_x / inverse, -across / inverse], axis=1)
+    return np.where(good[:, None], image, [0.0, 0.0, square, square, 0.0])
 
 
 class _MomentsOfExposure(_Moments, StatisticalRenderer):

@@ -106,8 +106,6 @@ class StatisticalRenderer(LongExposureRenderer):
 
     # What is left out moves e by 1e-6 and pixels by 3e-5 of the peak, a hundredth of what third moments would.
     negligible = 1e-4
-    # e is within 1e-4 then, size within 3e-4.
-    least_lit_of_dense = 0.5
 
     def __init__(self, inputs: PsfInputs, options: StatisticalEngine) -> None:
         air = inputs.atmosphere

@@ -16,7 +16,7 @@ from pachon.wavefront.atmosphere.turbulence import diffraction_otf, structure_fu
 from pachon.wavefront.psf.engine import PsfInputs, Stars
 from pachon.wavefront.psf.image_plane import ImagePlane
 from pachon.wavefront.psf.lattice_pupil import FEWEST_POINTS, LatticeTransfer
-from pachon.wavefront.psf.long_exposure import LongExposureEngine, LongExposureRenderer, default_points
+from pachon.wavefront.psf.long_exposure import LongExposureEngine, default_points
 from pachon.wavefront.psf.mean_rays import MeanRaysRenderer
 from pachon.wavefront.psf.psf import make_psfs
 from pachon.wavefront.psf.stamps import Stamps
@@ -110,8 +110,7 @@ def test_against_brute_force_over_the_pupil(make, field_deg, plane, wavelengths,
 
 
 @pytest.mark.long
-def test_many_spokes_of_a_half_lit_pupil(monkeypatch):
-    monkeypatch.setattr(LongExposureRenderer, "least_lit_of_dense", 0.5)
+def test_many_spokes_of_a_half_lit_pupil():
     for telescope, field_deg in (
         (defocused("lsst_v3.3_r", 10e-6), (1.5, 1.21)),
         (tube(defocused("lsst_v3.3_r", 0.0)), (0.6, 0.85)),
@@ -122,8 +121,8 @@ def test_many_spokes_of_a_half_lit_pupil(monkeypatch):
         assert 0.5 < stars.lit_fraction[0, 0] < 0.6
         (e, size), (e_wave, size_wave) = shape(stars.image[0], scale), shape(expected, scale)
         np.testing.assert_allclose(e, e_wave, atol=1e-4)
-        # Strips overlap where two rims meet.
-        assert size == pytest.approx(size_wave, rel=3.5e-4)
+        # Strips that overlapped where two rims meet would make 1.7e-4 and 3.2e-4.
+        assert size == pytest.approx(size_wave, rel=5e-5)
 
 
 def closed_form(plane, diameter, obscuration, focal, wavelength, r0, margin=1.25):
