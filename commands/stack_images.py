@@ -91,6 +91,8 @@ def stack_images_command(
 
 def _stack_rows(metrics: dict[str, dict[str, Any]]) -> Rows:
     rows = []
+    shifts: list[str]
+    response: str
     for visits, stack_metrics in metrics.items():
         densities = [
             NumberText(stack_metrics[key], ".1f")
