@@ -22,8 +22,6 @@ from .pictures import BLUE, GREEN, GREY, ORANGE, THEMES, Picture
 
 #: Bars of sensitivities at most.
 _MOST_BARS = 16
-#: Range of a logarithmic axis from which its labels are powers of ten alone.
-_WIDE = 100.0
 
 
 class MtfPicture(Picture):
@@ -59,10 +57,6 @@ class MtfPicture(Picture):
         self.figure.legend.items[-1].visible = reference is not None
 
 
-def _log_ticks(low: int, high: int, mantissas: Sequence[int]) -> list[float]:
-    return [float(f"{mantissa}e{power}") for power in range(low, high) for mantissa in mantissas]
-
-
 class WhiskerCorrelationPicture(Picture):
     """xi+ of the whiskers, of those of the state that is compared to, and of the change between both."""
 
@@ -81,7 +75,9 @@ class WhiskerCorrelationPicture(Picture):
             marks = {"line_color": color, "fill_color": color, "fill_alpha": "alpha", "size": 8, "line_width": 1.5}
             self.figure.scatter("r", "size", marker=marker, **marks, **style)
         self.figure.legend.location = "bottom_left"
-        self.figure.xaxis.ticker = FixedTicker(ticks=_log_ticks(-2, 5, (1, 2, 5)))
+        self.figure.xaxis.ticker = FixedTicker(
+            ticks=[float(f"{first}e{power}") for power in range(-2, 5) for first in (1, 2, 5)]
+        )
         self.figure.yaxis.formatter = CustomJSTickFormatter(code="return tick.toExponential(0)")
         scatters = [renderer for renderer in self.figure.renderers if "fill_alpha" in renderer.glyph.properties()]
         tips = [("separation", "@r{0.0} arcmin"), ("xi+", "@xi")]

@@ -29,8 +29,9 @@ WAVEFRONT, SPOTS = f"rms of Z4 to Z{JMAX} at the star", "rms spot radius over th
 METRICS = (WAVEFRONT, SPOTS, *(f"Z{j} at the star" for j in range(4, 12)))
 #: Evaluations of the merit between two pictures of an optimisation.
 _EVALUATIONS = 4
-#: Whiskers on a CCD for a correlation, and its bins of separation.
+#: Whiskers on a CCD where they are many: for a correlation, and drawn after a moment.
 PER_CCD = 10
+#: Bins of separation.
 _BINS = 10
 
 

@@ -25,6 +25,7 @@ from bokeh.models import (
 
 from ..core.errors import PachonError
 from .bench import Bench, Control
+from .design_views import PER_CCD
 from .page_session import PageSession
 from .panels import BesidePanel, CorrelationPanel, MtfPanel, OptimizePanel, Panel, SensitivityPanel, SpacePanel
 from .pictures import (
@@ -151,7 +152,9 @@ class Session(PageSession):
         self.background.on_change("value", lambda attribute, old, new: self._set_background(new))
         stars = "CCD" if self.bench.camera is not None else "place"
         self.density = Select(
-            title="Whiskers", value="1", options=[("1", f"1 a {stars}"), ("10", f"10 a {stars}, after a moment")]
+            title="Whiskers",
+            value="1",
+            options=[("1", f"1 a {stars}"), (str(PER_CCD), f"{PER_CCD} a {stars}, after a moment")],
         )
         self.density.sizing_mode = "stretch_width"
         self.density.on_change("value", lambda attribute, old, new: self.schedule())

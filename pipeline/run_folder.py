@@ -10,11 +10,12 @@ from ..core.errors import PachonError
 from ..core.long_work import claim_folder
 from ..core.products import Card, Stamp, is_whole
 from ..core.version import VERSION
-from ..reconstruction.ccd_product import MODEL_CARD, product_path, write_product
+from ..reconstruction.ccd_product import MODEL_CARD, CcdProduct, product_path, write_product
 from .config import load_configuration, to_yaml
 from .experiment import Experiment
 from .listed_visit import visit_cards
 from .simulate.ccd_exposure import CcdExposure
+from .simulate.ccd_loop import one_by_one
 from .simulate.ccd_model import model_ccds
 
 CONFIG_NAME, SUMMARY_NAME = "config.yaml", "summary.json"
@@ -60,18 +61,13 @@ def write_ccds(experiment: Experiment, folder: Path, exposures: Sequence[CcdExpo
     Nothing is written after a product that cannot be.
     """
     stamp = stamp_of(experiment)
-    errors: list[PachonError | None] = []
-    for exposure, product in zip(exposures, model_ccds(experiment, exposures), strict=True):
+
+    def write(exposure: CcdExposure, product: CcdProduct | PachonError) -> None:
         if isinstance(product, PachonError):
-            errors.append(product)
-            continue
-        try:
-            write_product(folder, product, stamp, ccd_cards(experiment, exposure.name))
-        except PachonError as error:
-            errors.append(error)
-            break
-        errors.append(None)
-    return errors
+            raise product
+        write_product(folder, product, stamp, ccd_cards(experiment, exposure.name))
+
+    return one_by_one(write, exposures, model_ccds(experiment, exposures))
 
 
 def ccd_cards(experiment: Experiment, ccd: str) -> list[Card]:

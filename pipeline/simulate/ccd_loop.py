@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
-from ...core.errors import DomainError, PachonError, ProductError
+from ...core.errors import DomainError, PachonError, ProductError, attempt
 from ...core.progress import Reporter
 from ...core.threads import thread_count
 from ..experiment import Experiment
@@ -105,6 +105,19 @@ def simulate_ccds(
                 stage.step(exposure.name, exposed_ccds, len(names))
         collect()
     return simulated
+
+
+def one_by_one(reduce: Callable[..., _T], *columns: Sequence[Any]) -> list[_T | PachonError]:
+    """Return a reduction of each CCD, whose arguments are a row of the columns, with the error of a CCD in its place.
+
+    Nothing comes after a product that cannot be written.
+    """
+    results: list[_T | PachonError] = []
+    for row in zip(*columns, strict=True):
+        results.append(attempt(reduce, *row))
+        if isinstance(results[-1], ProductError):
+            break
+    return results
 
 
 def _groups(

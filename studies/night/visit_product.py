@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core.errors import DomainError, PachonError, ProductError, attempt
+from ...core.errors import DomainError, PachonError, ProductError
 from ...core.products import Columns, Stamp, column, read_fits, table_hdu, write_fits
 from ...core.progress import Reporter
 from ...pipeline.experiment import Experiment
@@ -18,7 +18,7 @@ from ...pipeline.listed_visit import visit_experiment
 from ...pipeline.resolved_values import resolved_value
 from ...pipeline.run_folder import ccd_cards
 from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_stars
-from ...pipeline.simulate.ccd_loop import simulate_ccds
+from ...pipeline.simulate.ccd_loop import one_by_one, simulate_ccds
 from ...pipeline.simulate.ccd_model import model_ccds
 from ...pipeline.simulate.photometry import PROVISIONAL_FWHM
 from ...pipeline.simulate.sky_axes import sky_jacobians
@@ -126,7 +126,7 @@ class VisitWork:
             products: Sequence[CcdProduct | PachonError | None] = [None] * len(exposures)
             if self.config.models:
                 products = model_ccds(experiment, exposures, leave_one_out=self.config.products)
-            return [attempt(reduce_ccd, *each) for each in zip(exposures, products, strict=True)]
+            return one_by_one(reduce_ccd, exposures, products)
 
         def reduce_ccd(exposure: CcdExposure, product: CcdProduct | PachonError | None) -> None:
             ccd = experiment.camera.ccd_index(exposure.name)

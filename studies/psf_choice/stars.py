@@ -7,7 +7,6 @@ from functools import cached_property
 
 import numpy as np
 
-from ...core.errors import attempt
 from ...core.progress import Reporter
 from ...core.random_streams import stream
 from ...core.statistics import finite_mean
@@ -17,7 +16,7 @@ from ...measure.shapes import Shapes, measure_shapes
 from ...measure.stamps import observe_stamps
 from ...pipeline.experiment import Experiment
 from ...pipeline.simulate.ccd_exposure import CcdExposure
-from ...pipeline.simulate.ccd_loop import simulate_ccds
+from ...pipeline.simulate.ccd_loop import one_by_one, simulate_ccds
 from ...pipeline.simulate.ccd_observation import Observation, collected_images, observe_ccd
 from ...pipeline.simulate.photometry import (
     effective_fwhm,
@@ -75,7 +74,7 @@ def simulate(experiment: Experiment, threads: int | None, reporter: Reporter) ->
     with experiment.screens(threads, reporter):
         simulated = simulate_ccds(
             experiment,
-            lambda exposures: [attempt(measured, exposure) for exposure in exposures],
+            lambda exposures: one_by_one(measured, exposures),
             title="stars",
             threads=threads,
             reporter=reporter,
