@@ -11,13 +11,14 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import wait
 from pathlib import Path
 from typing import Any
 
 import warp as wp
 
 from .errors import ProductError
+from .launch_threads import helpers
 from .threads import thread_count
 
 wp.config.log_level = wp.LOG_ERROR
@@ -122,8 +123,10 @@ def launch(
         first, end = (count * k // slices for k in (i, i + 1))
         wp.launch(kernel, dim=end - first, inputs=[first, *inputs], device=device)
 
-    if slices == 1:
+    others = [helpers().submit(run, i) for i in range(1, slices)]
+    try:
         run(0)
-        return
-    with ThreadPoolExecutor(slices) as pool:
-        list(pool.map(run, range(slices)))
+    finally:
+        wait(others)
+    for other in others:
+        other.result()

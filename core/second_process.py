@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -14,6 +13,7 @@ from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 from .errors import ProductError
+from .launch_threads import end_if_alone
 from .threads import thread_count
 from .workers import begin_worker
 
@@ -32,8 +32,8 @@ def second_process(threads: int | None = None) -> Iterator[Submit]:
     are then done in this process, at once. Waiting for a result raises what the computation has raised, or ProductError
     if the process was killed.
     """
-    alone = threading.active_count() == 1 and not current_process().daemon
-    if thread_count(threads) == 1 or not alone or sys.platform != "linux":
+    possible = thread_count(threads) > 1 and sys.platform == "linux" and not current_process().daemon
+    if not possible or not end_if_alone():
         yield _run_at_once
         return
     pool = ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=begin_worker, initargs=(os.getpid(),))

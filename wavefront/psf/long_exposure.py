@@ -63,17 +63,13 @@ _LARGEST_LEFT = 1e-3
 # Part of the ring that is lit from which on rims cross few spokes. At 8 um of defocus e of the LSST is wrong by 1e-4 at
 # 0.8, by 1e-3 at 0.61.
 _LEAST_LIT = 0.75
-# The same of many spokes, beyond which the lattice stands for them: at 0.55 e of the LSST is wrong by 1e-4, its size by
-# 4e-5; at 0.38 by 3e-4, both.
-_LEAST_LIT_OF_DENSE = 0.5
-# Points on many spokes, and rings.
-_DENSE_POINTS = 768
-_DENSE_RINGS = 6
-# Kinds of stars beside those of so many rays: near focus.
+# Spokes and rings of stars that are lit less, and from which part on: e of the LSST is wrong by 1e-4 at most above 0.6,
+# in sizes too; by 5e-5 with the most spokes at 0.55, its size by 1e-4. The lattice stands for them below, where these
+# would make e wrong by 3e-4 at 0.38.
+_DENSE = ((0.6, 64, 5), (0.5, 128, 6))
+# Kinds of stars beside those of so many rays: near focus; then each of _DENSE, from -1 downwards; and by the lattice.
 _NEAR = 0
-# Vignetted: on many spokes, and by the lattice.
-_DENSE = -1
-_VIGNETTED = -2
+_VIGNETTED = -1 - len(_DENSE)
 # Bytes of a point of the lattice and a wavelength.
 _LATTICE_BYTES = 24
 # Most stars of one batch.
@@ -238,7 +234,9 @@ class LongExposureRenderer(PsfRenderer):
             return self._expose_lattice(stars)
         optics, edges = self._near_optics(stars, self._pupil)
         lit = self._lit_fraction(edges)
-        kinds = np.where(lit < _LEAST_LIT, np.where(lit < _LEAST_LIT_OF_DENSE, _VIGNETTED, _DENSE), _NEAR)
+        kinds = np.full(len(lit), _NEAR)
+        for kind, least in enumerate([_LEAST_LIT, *(least for least, _, _ in _DENSE)], 1):
+            kinds[lit < least] = -kind
         if self._options.n_pupil is None:
             rays = self._ray_counts(optics)
             kinds = np.where(rays > 0, rays, kinds)
@@ -250,9 +248,12 @@ class LongExposureRenderer(PsfRenderer):
             """Expose stars of a kind: by strips, by a lattice or, far from focus, by a number of rays."""
             if kind == _NEAR:
                 return self._expose_spokes(optics.stars(near), edges[near], stars, self._pupil)
-            if kind == _DENSE:
-                return self._expose_dense(stars)
-            return self._expose_lattice(stars) if kind == _VIGNETTED else self._expose_rays(kind, stars)
+            if kind == _VIGNETTED:
+                return self._expose_lattice(stars)
+            if kind < _NEAR:
+                _, n_spoke, n_ring = _DENSE[-1 - kind]
+                return self._expose_dense(stars, n_spoke, n_ring)
+            return self._expose_rays(kind, stars)
 
         return expose_by_kind(kinds, expose, stars)
 
@@ -260,9 +261,9 @@ class LongExposureRenderer(PsfRenderer):
         """Return the optics of stars through points on spokes, and the edges of their clear pupils."""
         return self._trace(stars.fields, pupil.points, self._threads), self._edges(stars.fields, pupil)
 
-    def _expose_dense(self, stars: Stars) -> ExposedStars:
-        """Expose stars by strips along many spokes."""
-        pupil = SpokePupil.fill(self._diameter, self._obscuration, _DENSE_POINTS, _DENSE_RINGS)
+    def _expose_dense(self, stars: Stars, n_spoke: int, n_ring: int) -> ExposedStars:
+        """Expose stars by strips along so many spokes."""
+        pupil = SpokePupil.fill(self._diameter, self._obscuration, n_spoke * n_ring, n_ring)
         step = max(1, self.batch * len(self._pupil.points) // len(pupil.points))
         parts = []
         for first in range(0, len(stars), step):

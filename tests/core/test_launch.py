@@ -1,0 +1,50 @@
+"""Launches of kernels: on several threads, from several threads, and in a forked process."""
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+import pachon
+from pachon.wavefront.pupil_optics import trace_pupils
+
+FIELDS = np.radians(np.stack(np.meshgrid(np.linspace(-1, 1, 8), np.linspace(-1, 1, 8)), axis=-1).reshape(-1, 2))
+PUPIL = np.array([[3.0, 0.5], [-2.8, 2.0], [0.1, -3.5]])
+
+
+def paths(telescope, threads):
+    return trace_pupils(telescope, FIELDS, np.array([620e-9]), PUPIL, threads=threads).path
+
+
+def test_launches_of_several_threads_at_once():
+    telescope = pachon.load_telescope("lsst_v3.3_r")
+    alone = paths(telescope, 1)
+    with ThreadPoolExecutor(6) as pool:
+        for together in pool.map(lambda _: paths(telescope, 5), range(12)):
+            np.testing.assert_array_equal(together, alone)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are not forked elsewhere")
+def test_launches_in_a_forked_process():
+    code = """
+import os, signal, sys, warnings
+import numpy as np
+import pachon
+from pachon.wavefront.pupil_optics import trace_pupils
+
+telescope = pachon.load_telescope("lsst_v3.3_r")
+fields, points = np.zeros((9, 2)), np.array([[3.0, 0.5]])
+
+def paths():
+    return trace_pupils(telescope, fields, np.array([620e-9]), points, threads=3).path
+
+before = paths()
+warnings.simplefilter("ignore", DeprecationWarning)
+if (child := os.fork()) == 0:
+    signal.alarm(60)
+    os._exit(0 if np.array_equal(paths(), before) else 1)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
