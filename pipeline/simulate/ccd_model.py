@@ -26,6 +26,38 @@ from .sky_axes import sky_jacobians
 from .star_field import StarField
 
 
+class ModelledMoments(NamedTuple):
+    """Adaptive moments of stars, and of their models, as :class:`.HoldoutStars` has them, each [n]."""
+
+    sigma: np.ndarray  #: [rad]
+    g1: np.ndarray
+    g2: np.ndarray
+    model_sigma: np.ndarray  #: [rad]
+    model_g1: np.ndarray
+    model_g2: np.ndarray
+
+
+class CcdFit(NamedTuple):
+    """How the PSF model of one CCD fits: what of a :class:`.CcdProduct` the visits of a night keep."""
+
+    name: str
+    pixel_scale: float  #: angle of a pixel [rad]
+    holdout: ModelledMoments  #: at the holdout positions
+    observed: ModelledMoments  #: of the stars that the model is fitted to
+
+    @classmethod
+    def of(cls, product: CcdProduct) -> CcdFit:
+        """Return that of a product."""
+        holdout, observed, used = product.holdout, product.observed, product.observed.used
+        keys = ModelledMoments._fields
+        return cls(
+            product.name,
+            product.pixel_scale,
+            ModelledMoments(*(getattr(holdout, key) for key in keys)),
+            ModelledMoments(*(getattr(observed, key)[used] for key in keys)),
+        )
+
+
 class _ObservedCcd(NamedTuple):
     """Stars of one CCD before they are modelled."""
 
@@ -49,30 +81,46 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
 
 
 def model_ccds(
-    experiment: Experiment, exposures: Sequence[CcdExposure], *, noisy: bool = True, leave_one_out: bool = True
+    experiment: Experiment, exposures: Sequence[CcdExposure], *, noisy: bool = True
 ) -> list[CcdProduct | PachonError]:
     """Return the products of CCDs as :func:`model_ccd` does, with the error of a CCD in its place.
 
     No CCD changes a byte of another: together they cost less, as covariances are searched and rays traced at once.
-    Without `leave_one_out` the shapes of models fitted without each star are NaN, and nothing else changes.
     """
-    ccds = [attempt(_observed, experiment, exposure, noisy=noisy) for exposure in exposures]
-    observed = [ccd for ccd in ccds if not isinstance(ccd, PachonError)]
-    models = iter(fit_ccd_models(experiment, [ccd.model_stars for ccd in observed], noisy=noisy))
-    jacobians = iter(_jacobians(experiment, observed))
+    modelled = _modelled(experiment, exposures, noisy=noisy)
+    jacobians = iter(_jacobians(experiment, [ccd[0] for ccd in modelled if not isinstance(ccd, PachonError)]))
     products: list[CcdProduct | PachonError] = []
-    for ccd in ccds:
+    for ccd in modelled:
+        sky_axes = ccd if isinstance(ccd, PachonError) else next(jacobians)
         if isinstance(ccd, PachonError):
             products.append(ccd)
-            continue
-        model, sky_axes = next(models), next(jacobians)
-        if isinstance(model, PachonError):
-            products.append(model)
         elif isinstance(sky_axes, PachonError):
             products.append(sky_axes)
         else:
-            products.append(attempt(_product, experiment, ccd, model, sky_axes, leave_one_out))
+            products.append(attempt(_product, experiment, *ccd, sky_axes))
     return products
+
+
+def fit_ccds(experiment: Experiment, exposures: Sequence[CcdExposure]) -> list[CcdFit | PachonError]:
+    """Return how the models of :func:`model_ccds` fit, to the same digits, without what only products have."""
+    return [
+        ccd if isinstance(ccd, PachonError) else attempt(_fit, experiment, *ccd)
+        for ccd in _modelled(experiment, exposures, noisy=True)
+    ]
+
+
+def _modelled(
+    experiment: Experiment, exposures: Sequence[CcdExposure], *, noisy: bool
+) -> list[tuple[_ObservedCcd, PsfModel] | PachonError]:
+    """Return the stars of CCDs and their model, with the error of a CCD in its place."""
+    ccds = [attempt(_observed, experiment, exposure, noisy=noisy) for exposure in exposures]
+    stars = [ccd.model_stars for ccd in ccds if not isinstance(ccd, PachonError)]
+    models = iter(fit_ccd_models(experiment, stars, noisy=noisy))
+    modelled: list[tuple[_ObservedCcd, PsfModel] | PachonError] = []
+    for ccd in ccds:
+        model = ccd if isinstance(ccd, PachonError) else next(models)
+        modelled.append(model if isinstance(model, PachonError) or isinstance(ccd, PachonError) else (ccd, model))
+    return modelled
 
 
 def _observed(experiment: Experiment, exposure: CcdExposure, *, noisy: bool) -> _ObservedCcd:
@@ -100,12 +148,58 @@ def _jacobians(experiment: Experiment, ccds: Sequence[_ObservedCcd]) -> list[lis
     return [together[i : i + 2] for i in range(0, len(together), 2)]
 
 
+class _Compared(NamedTuple):
+    """Images of the model of one CCD, and adaptive moments of stars and models."""
+
+    colours: np.ndarray | None  #: of the stars
+    holdout_models: np.ndarray
+    star_models: np.ndarray
+    holdout: tuple[AdaptiveMoments, AdaptiveMoments]
+    observed: tuple[AdaptiveMoments, AdaptiveMoments]
+
+
+def _adaptive_of(experiment: Experiment, images: np.ndarray, pixel_scale: float) -> AdaptiveMoments:
+    """Measure stamps of stars [n, ny, nx]."""
+    # From near the width of stars the iteration takes half the steps. Other CCDs are exposed meanwhile.
+    start = experiment.weight_fwhm / FWHM_PER_RMS
+    return adaptive_moments(images, pixel_scale, start_sigma=start, threads=1)
+
+
+def _compared(experiment: Experiment, ccd: _ObservedCcd, model: PsfModel, rows: np.ndarray | slice) -> _Compared:
+    """Compare the model of one CCD with noise-free PSFs at the holdout positions, and with the stars of some rows."""
+    holdout, stars, observation = ccd.exposure.holdout, ccd.stars, ccd.observation
+    # Noise-free PSFs are those of flat spectra.
+    colours, flat = star_colours(experiment, stars), float(experiment.wavelengths.mean())
+    holdout_models = model.at(ccd.exposure.positions.holdout, colour=flat)
+    star_models = model.at(stars.observed, colour=colours)
+    # Like e, g is not that of a star with a defect.
+    clean_stars = np.where((observation.defects == 0)[rows, None, None], observation.images[rows], np.nan)
+
+    def both(images: np.ndarray, models: np.ndarray) -> tuple[AdaptiveMoments, AdaptiveMoments]:
+        first, second = (_adaptive_of(experiment, stamps, holdout.pixel_scale) for stamps in (images, models))
+        return first, second
+
+    return _Compared(
+        colours,
+        holdout_models,
+        star_models,
+        both(holdout.image.astype(np.float64), holdout_models),
+        both(clean_stars, star_models[rows]),
+    )
+
+
+def _fit(experiment: Experiment, ccd: _ObservedCcd, model: PsfModel) -> CcdFit:
+    """Return how the model of one CCD fits."""
+    compared = _compared(experiment, ccd, model, ccd.observation.used)
+    holdout, observed = (
+        ModelledMoments(first.sigma, first.g1, first.g2, second.sigma, second.g1, second.g2)
+        for first, second in (compared.holdout, compared.observed)
+    )
+    return CcdFit(ccd.exposure.name, ccd.exposure.holdout.pixel_scale, holdout, observed)
+
+
 def _product(
-    experiment: Experiment,
-    ccd: _ObservedCcd,
-    model: PsfModel,
-    jacobians: Sequence[np.ndarray] | None,
-    leave_one_out: bool,
+    experiment: Experiment, ccd: _ObservedCcd, model: PsfModel, jacobians: Sequence[np.ndarray] | None
 ) -> CcdProduct:
     """Compare the model of one CCD with its stars, and with the noise-free PSFs between them."""
     config, stars, observation = experiment.config, ccd.stars, ccd.observation
@@ -127,20 +221,10 @@ def _product(
     def shapes_of(images: np.ndarray) -> Shapes:
         return measure_shapes(images, observed.pixel_scale, experiment.weight_fwhm)
 
-    def adaptive_of(images: np.ndarray) -> AdaptiveMoments:
-        # From near the width of stars the iteration takes half the steps. Other CCDs are exposed meanwhile.
-        start = experiment.weight_fwhm / FWHM_PER_RMS
-        return adaptive_moments(images, observed.pixel_scale, start_sigma=start, threads=1)
-
-    # Noise-free PSFs are those of flat spectra.
-    colours, flat = star_colours(experiment, stars), float(experiment.wavelengths.mean())
-    holdout_models = model.at(positions.holdout, colour=flat)
-    star_models = model.at(stars.observed, colour=colours)
-    left_out_models = model.leave_one_out() if leave_one_out else np.empty((0, *holdout_images.shape[1:]))
+    compared = _compared(experiment, ccd, model, slice(None))
+    left_out_models = model.leave_one_out()
+    left_out_moments = _adaptive_of(experiment, left_out_models, observed.pixel_scale)
     x, y = experiment.camera.centers[experiment.camera.ccd_index(name)]
-    # Like e, g is not that of a star with a defect.
-    clean_stars = np.where((observation.defects == 0)[:, None, None], observation.images, np.nan)
-    holdout_moments, star_moments = adaptive_of(holdout_images), adaptive_of(clean_stars)
     holdout_axes, star_axes = (None, None) if jacobians is None else jacobians
     return CcdProduct(
         name=name,
@@ -149,23 +233,23 @@ def _product(
         noise=observation.noise,
         holdout=HoldoutStars(
             **_position_columns(experiment, positions.holdout, holdout.fields),
-            **_shape_columns(holdout_shapes, shapes_of(holdout_models)),
-            **_adaptive_columns(holdout_moments, adaptive_of(holdout_models)),
-            **_sky_columns(holdout_axes, holdout_shapes, holdout_moments),
+            **_shape_columns(holdout_shapes, shapes_of(compared.holdout_models)),
+            **_adaptive_columns(*compared.holdout),
+            **_sky_columns(holdout_axes, holdout_shapes, compared.holdout[0]),
             fwhm=fwhm(holdout.image, holdout.pixel_scale),
         ),
         observed=ObservedStars(
             **_position_columns(experiment, stars.observed, observed.fields),
-            **_shape_columns(observation.shapes, shapes_of(star_models)),
-            **_adaptive_columns(star_moments, adaptive_of(star_models)),
-            **_sky_columns(star_axes, observation.shapes, star_moments),
-            **_leave_one_out_columns(used, shapes_of(left_out_models), adaptive_of(left_out_models)),
+            **_shape_columns(observation.shapes, shapes_of(compared.star_models)),
+            **_adaptive_columns(*compared.observed),
+            **_sky_columns(star_axes, observation.shapes, compared.observed[0]),
+            **_leave_one_out_columns(used, shapes_of(left_out_models), left_out_moments),
             magnitude=stars.magnitude,
             electrons=ccd.electrons,
             snr=ccd.snr,
             defects=observation.defects,
             used=used,
-            colour=colours,
+            colour=compared.colours,
         ),
         holdout_images=holdout_images.astype(np.float32),
         observed_images=observation.images.astype(np.float32),
@@ -250,12 +334,11 @@ def _adaptive_columns(measured: AdaptiveMoments, model: AdaptiveMoments) -> dict
 
 
 def _leave_one_out_columns(used: np.ndarray, shapes: Shapes, adaptive: AdaptiveMoments) -> dict[str, np.ndarray]:
-    """Return shapes of models fitted without each used star in turn; NaN for the other stars, and without shapes."""
+    """Return shapes of models fitted without each used star in turn; NaN for the other stars."""
     values = {"e1": shapes.e1, "e2": shapes.e2, "g1": adaptive.g1, "g2": adaptive.g2, "sigma": adaptive.sigma}
     columns = {}
     for key, of_used in values.items():
         column = np.full(len(used), np.nan)
-        if len(of_used):
-            column[used] = of_used
+        column[used] = of_used
         columns[f"leave_one_out_{key}"] = column
     return columns

@@ -19,8 +19,8 @@ from ...models.camera.camera import Camera
 from ...models.camera.photometry import BANDS
 from ...pipeline.experiment import Experiment
 from ...pipeline.simulate.ccd_exposure import NoiseFreeStars
+from ...pipeline.simulate.ccd_model import CcdFit, ModelledMoments
 from ...pipeline.simulate.photometry import instrument_noise, sky_electrons_per_pixel
-from ...reconstruction.ccd_product import CcdProduct, HoldoutStars
 
 #: Columns in order: unit in FITS notation, description.
 COLUMNS = {
@@ -78,7 +78,7 @@ class PlaceShapes(NamedTuple):
 
 
 def place_shapes(
-    experiment: Experiment, xy: np.ndarray, stars: NoiseFreeStars, measured: HoldoutStars | None = None
+    experiment: Experiment, xy: np.ndarray, stars: NoiseFreeStars, measured: ModelledMoments | None = None
 ) -> PlaceShapes:
     """Measure noise-free PSFs at places on the focal plane [m], if they are not `measured` already."""
     # Stamps may have finer pixels than the CCDs.
@@ -139,27 +139,25 @@ def effective_time(experiment: Experiment, sigma: float, sky: float, zero_point:
     return seconds * seeing * transparency * nominal_sky / (sky / seconds)
 
 
-def model_columns(experiment: Experiment, product: CcdProduct | None) -> dict[str, float]:
+def model_columns(experiment: Experiment, fit: CcdFit | None) -> dict[str, float]:
     """Return how a PSF model fits stars and noise-free PSFs; NaN without a model."""
-    if product is None:
+    if fit is None:
         return dict.fromkeys(MODEL_COLUMNS, math.nan)
-    camera, ccd = experiment.camera, experiment.camera.ccd_index(product.name)
-    pixel = product.pixel_scale * camera.pixel_size / experiment.pixel_size
-    stars, places = product.observed, product.holdout
+    camera, ccd = experiment.camera, experiment.camera.ccd_index(fit.name)
+    pixel = fit.pixel_scale * camera.pixel_size / experiment.pixel_size
 
-    def differences(table: object, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def differences(moments: ModelledMoments) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         shapes = []
-        for prefix in ("", "model_"):
-            sigma, g1, g2 = (getattr(table, f"{prefix}{key}")[rows] for key in ("sigma", "g1", "g2"))
+        for sigma, g1, g2 in (moments[:3], moments[3:]):
             xx, yy, xy = moments_along_pixels(camera, ccd, sigma / pixel, g1, g2)
             shapes.append(np.stack([(xx - yy) / (xx + yy), 2.0 * xy / (xx + yy), np.sqrt(0.5 * (xx + yy))]))
         first, second, third = shapes[0] - shapes[1]
         return first, second, third
 
-    columns: dict[str, float] = {"nPsfStar": float(stars.used.sum())}
-    for name, values in zip(("E1", "E2", "Size"), differences(stars, stars.used), strict=True):
+    columns: dict[str, float] = {"nPsfStar": float(len(fit.observed.sigma))}
+    for name, values in zip(("E1", "E2", "Size"), differences(fit.observed), strict=True):
         columns[f"psfStarDelta{name}Median"] = median = finite_median(values)
         columns[f"psfStarDelta{name}Scatter"] = _NORMAL_MAD * finite_median(np.abs(values - median))
-    for name, values in zip(("E1", "E2", "Size"), differences(places, np.arange(len(places.sigma))), strict=True):
+    for name, values in zip(("E1", "E2", "Size"), differences(fit.holdout), strict=True):
         columns[f"modelDelta{name}Rms"] = rms(values)
     return columns

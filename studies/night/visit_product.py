@@ -19,7 +19,7 @@ from ...pipeline.resolved_values import resolved_value
 from ...pipeline.run_folder import ccd_cards
 from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_stars
 from ...pipeline.simulate.ccd_loop import one_by_one, simulate_ccds
-from ...pipeline.simulate.ccd_model import model_ccds
+from ...pipeline.simulate.ccd_model import CcdFit, fit_ccds, model_ccds
 from ...pipeline.simulate.photometry import PROVISIONAL_FWHM
 from ...pipeline.simulate.sky_axes import sky_jacobians
 from ...pipeline.simulate.star_field import StarField
@@ -123,28 +123,29 @@ class VisitWork:
         ellipticities: dict[str, xi.PlaceEllipticities] = {}
 
         def reduce(exposures: Sequence[CcdExposure]) -> list[PachonError | None]:
-            products: Sequence[CcdProduct | PachonError | None] = [None] * len(exposures)
+            models: Sequence[CcdProduct | CcdFit | PachonError | None] = [None] * len(exposures)
             if self.config.models:
-                products = model_ccds(experiment, exposures, leave_one_out=self.config.products)
-            return one_by_one(reduce_ccd, exposures, products)
+                models = (model_ccds if self.config.products else fit_ccds)(experiment, exposures)
+            return one_by_one(reduce_ccd, exposures, models)
 
-        def reduce_ccd(exposure: CcdExposure, product: CcdProduct | PachonError | None) -> None:
+        def reduce_ccd(exposure: CcdExposure, model: CcdProduct | CcdFit | PachonError | None) -> None:
             ccd = experiment.camera.ccd_index(exposure.name)
-            measured = product.holdout if isinstance(product, CcdProduct) else None
+            fit = CcdFit.of(model) if isinstance(model, CcdProduct) else model
+            measured = fit.holdout if isinstance(fit, CcdFit) else None
             shapes = rows.place_shapes(experiment, exposure.positions.holdout, exposure.holdout, measured)
             if not np.isfinite(shapes.sigma[0]):
                 raise DomainError("the PSF in its middle has no shape: expected a CCD within the field")
-            if isinstance(product, PachonError):
-                raise product
-            if product is not None and self.config.products:
+            if isinstance(fit, PachonError):
+                raise fit
+            if isinstance(model, CcdProduct):
                 cards = ccd_cards(experiment, exposure.name)
-                write_product(folder, product, self.stamp, cards, f"visit_{visit.visit}_")
-            detectors[exposure.name] = _row(experiment, visit, exposure, shapes) | rows.model_columns(
-                experiment, product
-            )
+                write_product(folder, model, self.stamp, cards, f"visit_{visit.visit}_")
+            detectors[exposure.name] = _row(experiment, visit, exposure, shapes) | rows.model_columns(experiment, fit)
             places[ccd] = shapes
             truth = np.stack([shapes.g1, shapes.g2])
-            away = np.full_like(truth, np.nan) if product is None else np.stack(product.ellipticity("away", "g"))
+            away = np.full_like(truth, np.nan)
+            if fit is not None:
+                away = truth - np.stack([fit.holdout.model_g1, fit.holdout.model_g2])
             ellipticities[exposure.name] = xi.PlaceEllipticities(shapes.xy, truth, away)
 
         with experiment.screens(threads, reporter):

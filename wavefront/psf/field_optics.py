@@ -15,7 +15,7 @@ A star depends on no other: the directions are those of the telescope's field of
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -32,6 +32,7 @@ from ...models.telescope import Telescope
 from ...raytrace.aiming import entrance_points
 from ...raytrace.detector import land_on_ccds
 from ...raytrace.launch import launch_bundles
+from ...raytrace.pack.surfaces import clear_annulus
 from ...raytrace.rays import field_direction
 from ...raytrace.trace import trace
 from ..aberration import ResidualWavefront
@@ -132,6 +133,18 @@ class FieldOptics:
             wavelengths=self.wavelengths,
         ), edges
 
+    def turned(self, telescope: Telescope, angle: float) -> FieldOptics:
+        """Return the polynomials of a telescope whose detector is turned by an angle [rad], from x towards y."""
+        n_ray = len(self.wavelengths) * len(self.pupil)
+        # Pairs along x and y: of the chief ray place and slope, then of the Jacobian both columns, and of the rays.
+        x = np.concatenate([[0, 2, 4, 5], 8 + 2 * np.arange(2 * n_ray)])
+        y = np.concatenate([[1, 3, 6, 7], 9 + 2 * np.arange(2 * n_ray)])
+        coefficients = self.coefficients.copy()
+        cosine, sine = math.cos(angle), math.sin(angle)
+        coefficients[:, x] = cosine * self.coefficients[:, x] + sine * self.coefficients[:, y]
+        coefficients[:, y] = cosine * self.coefficients[:, y] - sine * self.coefficients[:, x]
+        return replace(self, telescope=telescope, coefficients=coefficients)
+
     def _cosines(self, chief: np.ndarray) -> np.ndarray:
         """Return unit vectors of chief rays along the axes of the detector, [n, 3]."""
         along_z = self.onward / np.sqrt(1.0 + (chief[:, 2:] ** 2).sum(axis=1, keepdims=True))
@@ -164,12 +177,33 @@ class FieldOptics:
 def field_optics(telescope: Telescope, wavelengths: tuple[float, ...], pupil: SpokePupil) -> FieldOptics | None:
     """Return the polynomials of a telescope through points on spokes; None where they are not good enough.
 
-    Those of the last few are stored.
+    Those of the last few are stored, for any angle of the rotator.
     """
-    return _field_optics(telescope, wavelengths, len(pupil.radius), pupil.n_spoke)
+    unturned, angle = _without_rotator(telescope)
+    optics = _field_optics(unturned, wavelengths, len(pupil.radius), pupil.n_spoke)
+    return optics if optics is None or angle == 0.0 else optics.turned(telescope, angle)
 
 
-@lru_cache(maxsize=4)
+def _without_rotator(telescope: Telescope) -> tuple[Telescope, float]:
+    """Return the telescope with the x axis of its detector as near to its own as a turn makes it, and the turn [rad].
+
+    The turn leads from there to the axes of the detector, about its normal. There is none where it would matter to
+    more than axes.
+    """
+    detector = telescope.surfaces[-1]
+    clear = clear_annulus(detector.aperture)
+    normal = detector.matrix[:, 2]
+    x = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
+    if clear is None or any(clear[:2]) or np.linalg.norm(x) < 0.5:
+        return telescope, 0.0
+    x /= np.linalg.norm(x)
+    axes = np.stack([x, np.cross(normal, x), normal], axis=1)
+    angle = math.atan2(axes[:, 1] @ detector.matrix[:, 0], x @ detector.matrix[:, 0])
+    rotation = tuple(tuple(float(v) + 0.0 for v in row) for row in axes)
+    return replace(telescope, surfaces=(*telescope.surfaces[:-1], replace(detector, rotation=rotation))), angle
+
+
+@lru_cache(maxsize=8)
 def _field_optics(
     telescope: Telescope, wavelengths: tuple[float, ...], n_ring: int, n_spoke: int
 ) -> FieldOptics | None:

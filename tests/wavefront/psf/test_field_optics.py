@@ -31,7 +31,9 @@ def spokes(telescope):
     return SpokePupil.fill(telescope.pupil_diameter, telescope.pupil_obscuration, 80)
 
 
-def test_optics_are_those_of_rays(lsst, plane):
+@pytest.mark.parametrize("rotator_deg", [0.0, 37.0])
+def test_optics_are_those_of_rays(lsst, plane, rotator_deg):
+    lsst = lsst.with_rotator(np.radians(rotator_deg))
     aberration = pachon.wavefront.ResidualWavefront.draw(lsst, 0.1e-6, 1, 0)
     fields = pachon.fields_at(lsst, plane.camera.centers[::23], WAVES[1])
     optics = field_optics(lsst, WAVES, spokes(lsst))
@@ -49,6 +51,16 @@ def test_optics_are_those_of_rays(lsst, plane):
         radius = np.hypot(*optics.pupil.T).reshape(1, -1, len(optics.unit))
         beside = (np.abs(radius[..., None] - edges[:, None]) > 5e-3).all(axis=-1).reshape(len(stars), 1, -1)
         assert (interpolated.lit == traced.lit)[np.broadcast_to(beside, traced.lit.shape)].all()
+
+
+def test_any_angle_of_the_rotator_has_the_same_polynomials(lsst):
+    tilted = lsst.perturbed(lsst.surfaces[-1].name, tilt=(1e-5, 2e-5, 0.0))
+    field_optics_module._field_optics.cache_clear()
+    for angle in (0.0, 0.7, -3.0):
+        field_optics(lsst.with_rotator(angle), WAVES, spokes(lsst))
+    assert field_optics_module._field_optics.cache_info().currsize == 1
+    field_optics(tilted, WAVES, spokes(lsst))
+    assert field_optics_module._field_optics.cache_info().currsize == 2
 
 
 def test_a_star_depends_on_no_other(lsst, plane):
