@@ -91,13 +91,13 @@ def model_ccds(
     jacobians = iter(_jacobians(experiment, [ccd[0] for ccd in modelled if not isinstance(ccd, PachonError)]))
     products: list[CcdProduct | PachonError] = []
     for ccd in modelled:
-        sky_axes = ccd if isinstance(ccd, PachonError) else next(jacobians)
         if isinstance(ccd, PachonError):
             products.append(ccd)
-        elif isinstance(sky_axes, PachonError):
-            products.append(sky_axes)
-        else:
-            products.append(attempt(_product, experiment, *ccd, sky_axes))
+            continue
+        sky_axes = next(jacobians)
+        products.append(
+            sky_axes if isinstance(sky_axes, PachonError) else attempt(_product, experiment, *ccd, sky_axes)
+        )
     return products
 
 
@@ -118,8 +118,11 @@ def _modelled(
     models = iter(fit_ccd_models(experiment, stars, noisy=noisy))
     modelled: list[tuple[_ObservedCcd, PsfModel] | PachonError] = []
     for ccd in ccds:
-        model = ccd if isinstance(ccd, PachonError) else next(models)
-        modelled.append(model if isinstance(model, PachonError) or isinstance(ccd, PachonError) else (ccd, model))
+        if isinstance(ccd, PachonError):
+            modelled.append(ccd)
+            continue
+        model = next(models)
+        modelled.append(model if isinstance(model, PachonError) else (ccd, model))
     return modelled
 
 

@@ -199,8 +199,10 @@ def _without_rotator(telescope: Telescope) -> tuple[Telescope, float]:
     x /= np.linalg.norm(x)
     axes = np.stack([x, np.cross(normal, x), normal], axis=1)
     angle = math.atan2(axes[:, 1] @ detector.matrix[:, 0], x @ detector.matrix[:, 0])
-    rotation = tuple(tuple(float(v) + 0.0 for v in row) for row in axes)
-    return replace(telescope, surfaces=(*telescope.surfaces[:-1], replace(detector, rotation=rotation))), angle
+    # Zeros are positive, so that equal axes are one key.
+    first, second, third = ((a + 0.0, b + 0.0, c + 0.0) for a, b, c in axes.tolist())
+    unturned = replace(detector, rotation=(first, second, third))
+    return replace(telescope, surfaces=(*telescope.surfaces[:-1], unturned)), angle
 
 
 @lru_cache(maxsize=8)

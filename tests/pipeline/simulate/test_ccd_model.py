@@ -8,7 +8,7 @@ import pytest
 from pachon.core.errors import DomainError
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
-from pachon.pipeline.simulate.ccd_model import model_ccd, model_ccds
+from pachon.pipeline.simulate.ccd_model import CcdFit, fit_ccds, model_ccd, model_ccds
 
 NAMES = ("R22_S11", "R41_S21", "R24_S12")
 
@@ -39,3 +39,11 @@ def test_ccds_modelled_together_have_the_bytes_of_each_alone(tiny):
                 equal_nan = values is not None and np.asarray(values).dtype.kind == "f"
                 assert together is values or np.array_equal(together, values, equal_nan=equal_nan), (table, name)
         assert product.holdout.g1_sky is not None
+    fits = fit_ccds(experiment, exposures)
+    assert str(fits[1]) == str(failed)
+    for fit, product in ((fits[0], first), (fits[2], third)):
+        of_product = CcdFit.of(product)
+        assert (fit.name, fit.pixel_scale) == (of_product.name, of_product.pixel_scale)
+        assert len(fit.observed.sigma) == product.observed.used.sum()
+        for moments, expected in ((fit.holdout, of_product.holdout), (fit.observed, of_product.observed)):
+            np.testing.assert_array_equal(moments, expected)
