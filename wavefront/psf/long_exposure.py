@@ -64,8 +64,8 @@ _LARGEST_LEFT = 1e-3
 # 0.8, by 1e-3 at 0.61.
 _LEAST_LIT = 0.75
 # Spokes and rings of stars that are lit less, and from which part on: e of the LSST is wrong by 1e-4 above 0.6, by 2e-4
-# with M2 10 um out of focus, its size by 1e-4; with the most spokes e by 5e-5 and its size by 1e-4. The lattice stands for them below, where these
-# would make e wrong by 3e-4 at 0.38.
+# with M2 10 um out of focus, its size by 1e-4; with the most spokes e by 5e-5 and its size by 1e-4. The lattice stands
+# for them below, where they would make e wrong by 3e-4 at 0.38.
 _DENSE = ((0.6, 64, 5), (0.5, 128, 6))
 # Kinds of stars beside those of so many rays: near focus; then each of _DENSE, from -1 downwards; and by the lattice.
 _NEAR = 0
