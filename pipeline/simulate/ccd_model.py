@@ -36,6 +36,11 @@ class ModelledMoments(NamedTuple):
     model_g1: np.ndarray
     model_g2: np.ndarray
 
+    @classmethod
+    def of(cls, measured: AdaptiveMoments, model: AdaptiveMoments) -> ModelledMoments:
+        """Return those of measurements."""
+        return cls(measured.sigma, measured.g1, measured.g2, model.sigma, model.g1, model.g2)
+
 
 class CcdFit(NamedTuple):
     """How the PSF model of one CCD fits: what of a :class:`.CcdProduct` the visits of a night keep."""
@@ -194,10 +199,7 @@ def _compared(experiment: Experiment, ccd: _ObservedCcd, model: PsfModel, rows: 
 def _fit(experiment: Experiment, ccd: _ObservedCcd, model: PsfModel) -> CcdFit:
     """Return how the model of one CCD fits."""
     compared = _compared(experiment, ccd, model, ccd.observation.used)
-    holdout, observed = (
-        ModelledMoments(first.sigma, first.g1, first.g2, second.sigma, second.g1, second.g2)
-        for first, second in (compared.holdout, compared.observed)
-    )
+    holdout, observed = ModelledMoments.of(*compared.holdout), ModelledMoments.of(*compared.observed)
     return CcdFit(ccd.exposure.name, ccd.exposure.holdout.pixel_scale, holdout, observed)
 
 
@@ -325,15 +327,7 @@ def _shape_columns(measured: Shapes, model: Shapes) -> dict[str, np.ndarray]:
 
 
 def _adaptive_columns(measured: AdaptiveMoments, model: AdaptiveMoments) -> dict[str, np.ndarray]:
-    return {
-        "g1": measured.g1,
-        "g2": measured.g2,
-        "sigma": measured.sigma,
-        "adaptive_flags": measured.flags,
-        "model_g1": model.g1,
-        "model_g2": model.g2,
-        "model_sigma": model.sigma,
-    }
+    return ModelledMoments.of(measured, model)._asdict() | {"adaptive_flags": measured.flags}
 
 
 def _leave_one_out_columns(used: np.ndarray, shapes: Shapes, adaptive: AdaptiveMoments) -> dict[str, np.ndarray]:

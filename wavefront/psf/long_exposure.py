@@ -234,9 +234,8 @@ class LongExposureRenderer(PsfRenderer):
             return self._expose_lattice(stars)
         optics, edges = self._near_optics(stars, self._pupil)
         lit = self._lit_fraction(edges)
-        kinds = np.full(len(lit), _NEAR)
-        for kind, least in enumerate([_LEAST_LIT, *(least for least, _, _ in _DENSE)], 1):
-            kinds[lit < least] = -kind
+        bounds = np.array([_LEAST_LIT, *(least for least, _, _ in _DENSE)])
+        kinds = _NEAR - (lit[:, None] < bounds).sum(axis=1)
         if self._options.n_pupil is None:
             rays = self._ray_counts(optics)
             kinds = np.where(rays > 0, rays, kinds)
