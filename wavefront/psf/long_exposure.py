@@ -51,6 +51,7 @@ from .long_exposure_kernels import place_points, sample_pixels, transform_pupils
 from .mean_rays import MeanRaysRenderer, drawing_ray_counts, ray_counts
 from .pupil_rims import strip_overlap
 from .sample_packets import LANES, samples
+from .spoke_sums import RIM_NUMBERS
 
 #: Pupil points by default: 16 spokes of 5 rings.
 PUPIL_POINTS = 80
@@ -402,7 +403,7 @@ class LongExposureRenderer(PsfRenderer):
             threads=self._threads,
         )
         along_x = np.empty((n_star, n_packet, depths * n_point, 2, LANES), dtype=np.float32)
-        along_y = np.empty((n_star, n_packet * LANES, depths * n_point, 2), dtype=np.float32)
+        along_y = np.empty_like(along_x)
         spectrum = np.empty((n_star, 4, n_row, n_packet, LANES), dtype=np.float32)
         launch(
             transform_pupils,
@@ -420,7 +421,10 @@ class LongExposureRenderer(PsfRenderer):
                 warp_array(self._filter_steps, wp.float32),
                 warp_array(np.ones((n_star, n_wave)) if photons is None else photons, wp.float32),
                 warp_array(along_x, samples),
-                warp_array(along_y, wp.float32),
+                warp_array(along_y, samples),
+                warp_array(np.empty((n_star, 2 * pupil.n_spoke, RIM_NUMBERS), dtype=np.float32), wp.float32),
+                warp_array(np.empty((n_star, 2 * pupil.n_spoke), dtype=np.int32), wp.int32),
+                warp_array(np.empty((n_star, 4, LANES), dtype=np.float32), samples),
                 warp_array(spectrum, samples),
             ],
             threads=self._threads,

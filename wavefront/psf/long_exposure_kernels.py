@@ -6,8 +6,9 @@ import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
 from .clear_pupil import MOST_RINGS
-from .packet_functions import squared_baseline, tabulated, unit_circle
+from .packet_functions import squared_baseline, tabulated_packet, unit_circle
 from .sample_packets import LANES, samples
+from .spoke_sums import add_inner_points, add_rims
 
 wp.set_module_options(FORWARD_OPTIONS)
 
@@ -167,24 +168,6 @@ def lane_numbers(packet: wp.int32):
 
 
 @wp.func
-def magnitudes(values: samples):
-    """Magnitude of each lane."""
-    out = samples()
-    for i in range(LANES):
-        out[i] = wp.abs(values[i])
-    return out
-
-
-@wp.func
-def shortened(width: samples, opposite: samples, whole: wp.float32):
-    """Width of a strip of a spoke whose strips take together at most its whole light, lane by lane."""
-    out = samples()
-    for i in range(LANES):
-        out[i] = width[i] * wp.min(wp.float32(1.0), whole / wp.max(width[i] + opposite[i], wp.float32(1e-20)))
-    return out
-
-
-@wp.func
 def filtered(
     table: wp.array2d(dtype=wp.float32),
     wave: wp.int32,
@@ -195,10 +178,10 @@ def filtered(
     row: wp.float32,
 ):
     """Value of the filter of a wavelength at the baselines of a row of frequencies, by linear interpolation."""
-    value = samples()
+    place = samples()
     for i in range(LANES):
-        value[i] = tabulated(table, wave, wp.sqrt(squared_baseline(metric, star, column[i], row)) * per_step)
-    return value
+        place[i] = wp.sqrt(squared_baseline(metric, star, column[i], row)) * per_step
+    return tabulated_packet(table[wave], wp.float32(table.shape[1]) - wp.float32(1.001), place)
 
 
 @wp.kernel
@@ -219,7 +202,10 @@ def transform_pupils(
     per_step: wp.array(dtype=wp.float32),
     photons: wp.array2d(dtype=wp.float32),
     along_x: wp.array4d(dtype=samples),
-    along_y: wp.array4d(dtype=wp.float32),
+    along_y: wp.array4d(dtype=samples),
+    rims: wp.array3d(dtype=wp.float32),
+    meeting: wp.array2d(dtype=wp.int32),
+    sums: wp.array2d(dtype=samples),
     spectrum: wp.array4d(dtype=samples),
 ):
     """Add up the transfer functions of one star's wavelengths, over columns m and rows +n and -n of frequencies.
@@ -229,10 +215,9 @@ def transform_pupils(
     Arguments: place, light, cut, lean as ``place_points`` leaves them; fade_x, fade_y [channel, packet]: filters along
     x, with their weights, and along y; wavelength [wave] [m]; rows [packet of columns]: their number; metric [star, 3]:
     xx, xy, yy of jacobian @ jacobian.T; table [wave, sample]: filter against the baseline; per_step [wave]: samples of
-    the table per step of frequency, for a unit Jacobian; photons [star, wave], of mean 1; along_x
-    [star, packet, depth * n_point + point, 2] and along_y [star, row, depth * n_point + point, 2]: room for cosines and
-    sines, side by side as the sums over points read them; spectrum [star, 4, row, packet]: real and imaginary parts at
-    +n, and at -n.
+    the table per step of frequency, for a unit Jacobian; photons [star, wave], of mean 1; along_x and
+    along_y [star, packet, depth * n_point + point, 2]: room for cosines and sines of columns and rows; rims, meeting and sums [star, ...]: room for those of
+    ``add_rims``; spectrum [star, 4, row, packet]: real and imaginary parts at +n, and at -n.
     """
     star = first + wp.tid()
     n_wave = wavelength.shape[0]
@@ -266,90 +251,47 @@ def transform_pupils(
                 for packet in range(n_packet):
                     number = lane_numbers(packet)
                     cosine, sine = unit_circle(-y * number)
-                    cosine = wp.cw_mul(fade_y[light_channel, packet], cosine)
-                    sine = wp.cw_mul(fade_y[light_channel, packet], sine)
-                    for i in range(LANES):
-                        along_y[star, packet * LANES + i, sample, 0] = cosine[i]
-                        along_y[star, packet * LANES + i, sample, 1] = sine[i]
+                    along_y[star, packet, sample, 0] = wp.cw_mul(fade_y[light_channel, packet], cosine)
+                    along_y[star, packet, sample, 1] = wp.cw_mul(fade_y[light_channel, packet], sine)
+        for rim in range(2 * n_spoke):
+            point = rim
+            if rim >= n_spoke:
+                point = rim + outer_start - n_spoke
+            rims[star, rim, 0] = wavelength[wave] * cut[star, rim, 0]
+            rims[star, rim, 1] = wavelength[wave] * cut[star, rim, 1]
+            rims[star, rim, 2] = lean[star, wave, rim, 0]
+            rims[star, rim, 3] = lean[star, wave, rim, 1]
+            rims[star, rim, 4] = light[star, point]
+            meeting[star, rim] = wp.where(
+                wavelength[wave] * cut[star, rim, 2] * wp.float32(rows[0]) > wp.float32(1.0), 1, 0
+            )
         for packet in range(n_packet):
             number = lane_numbers(packet)
             for row in range(rows[packet]):
                 ky = wp.float32(row)
-                cc = samples()
-                ss = samples()
-                cs = samples()
-                sc = samples()
-                for depth in range(n_depth):
-                    for point in range(depth * n_point + inner_end, depth * n_point + outer_start):
-                        a = along_x[star, packet, point, 0]
-                        b = along_x[star, packet, point, 1]
-                        c = along_y[star, row, point, 0]
-                        d = along_y[star, row, point, 1]
-                        cc = cc + c * a
-                        ss = ss + d * b
-                        cs = cs + d * a
-                        sc = sc + c * b
-                # At -n the sine along y has the other sign.
-                re_plus = cc - ss
-                im_plus = cs + sc
-                re_minus = cc + ss
-                im_minus = sc - cs
-                for rim in range(2 * n_spoke):
-                    point = rim
-                    if rim >= n_spoke:
-                        point = rim + outer_start - n_spoke
-                    a = along_x[star, packet, point, 0]
-                    b = along_x[star, packet, point, 1]
-                    c = along_y[star, row, point, 0]
-                    d = along_y[star, row, point, 1]
-                    cc = c * a
-                    ss = d * b
-                    cs = d * a
-                    sc = c * b
-                    for depth in range(1, n_depth):
-                        deeper = depth * n_point + point
-                        a = along_x[star, packet, deeper, 0]
-                        b = along_x[star, packet, deeper, 1]
-                        c = along_y[star, row, deeper, 0]
-                        d = along_y[star, row, deeper, 1]
-                        cc = cc + c * a
-                        ss = ss + d * b
-                        cs = cs + d * a
-                        sc = sc + c * b
-                    width_x = (wavelength[wave] * cut[star, rim, 0]) * number
-                    width_y = wavelength[wave] * cut[star, rim, 1] * ky
-                    lean_x = lean[star, wave, rim, 0] * number
-                    lean_y = lean[star, wave, rim, 1] * ky
-                    point_light = samples(light[star, point])
-                    opposite = (rim + n_spoke) % (2 * n_spoke)
-                    whole = light[star, point] * whole_spoke
-                    strips_meet = wavelength[wave] * cut[star, rim, 2] * wp.float32(rows[0]) > wp.float32(1.0)
-                    opposite_x = (wavelength[wave] * cut[star, opposite, 0]) * number
-                    opposite_y = wavelength[wave] * cut[star, opposite, 1] * ky
-                    width = magnitudes(width_x + samples(width_y))
-                    if strips_meet:
-                        width = shortened(width, magnitudes(opposite_x + samples(opposite_y)), whole)
-                    phase = wp.cw_mul(wp.cw_mul(width, width), lean_x + samples(lean_y))
-                    inside_light = point_light - width
-                    re = cc - ss
-                    im = cs + sc
-                    re_plus = re_plus + wp.cw_mul(inside_light, re) + wp.cw_mul(phase, im)
-                    im_plus = im_plus + wp.cw_mul(inside_light, im) - wp.cw_mul(phase, re)
-                    width = magnitudes(width_x - samples(width_y))
-                    if strips_meet:
-                        width = shortened(width, magnitudes(opposite_x - samples(opposite_y)), whole)
-                    phase = wp.cw_mul(wp.cw_mul(width, width), lean_x - samples(lean_y))
-                    inside_light = point_light - width
-                    re = cc + ss
-                    im = sc - cs
-                    re_minus = re_minus + wp.cw_mul(inside_light, re) + wp.cw_mul(phase, im)
-                    im_minus = im_minus + wp.cw_mul(inside_light, im) - wp.cw_mul(phase, re)
+                columns = along_x[star, packet]
+                lines = along_y[star, row // LANES]
+                total = sums[star]
+                add_inner_points(columns, lines, row, n_point, n_spoke, n_depth, total)
+                add_rims(
+                    columns,
+                    lines,
+                    rims[star],
+                    meeting[star],
+                    packet * LANES,
+                    row,
+                    whole_spoke,
+                    n_point,
+                    n_spoke,
+                    n_depth,
+                    total,
+                )
                 value = photons[star, wave] * filtered(table, wave, per_step[wave], metric, star, number, ky)
-                spectrum[star, 0, row, packet] = spectrum[star, 0, row, packet] + wp.cw_mul(value, re_plus)
-                spectrum[star, 1, row, packet] = spectrum[star, 1, row, packet] + wp.cw_mul(value, im_plus)
+                spectrum[star, 0, row, packet] = spectrum[star, 0, row, packet] + wp.cw_mul(value, sums[star, 0])
+                spectrum[star, 1, row, packet] = spectrum[star, 1, row, packet] + wp.cw_mul(value, sums[star, 1])
                 value = photons[star, wave] * filtered(table, wave, per_step[wave], metric, star, number, -ky)
-                spectrum[star, 2, row, packet] = spectrum[star, 2, row, packet] + wp.cw_mul(value, re_minus)
-                spectrum[star, 3, row, packet] = spectrum[star, 3, row, packet] + wp.cw_mul(value, im_minus)
+                spectrum[star, 2, row, packet] = spectrum[star, 2, row, packet] + wp.cw_mul(value, sums[star, 2])
+                spectrum[star, 3, row, packet] = spectrum[star, 3, row, packet] + wp.cw_mul(value, sums[star, 3])
 
 
 @wp.kernel

@@ -51,15 +51,6 @@ def squared_baseline(metric: wp.array2d(dtype=wp.float32), star: wp.int32, kx: w
     return wp.max(squared, wp.float32(0.0))
 
 
-@wp.func
-def tabulated(table: wp.array2d(dtype=wp.float32), wave: wp.int32, place: wp.float32):
-    """Linear interpolation in the table of a wavelength [samples], held at its end."""
-    at = wp.min(place, wp.float32(table.shape[1]) - wp.float32(1.001))
-    knot = wp.int32(at)
-    before = table[wave, knot]
-    return before + (at - wp.float32(knot)) * (table[wave, knot + 1] - before)
-
-
 # Loops in C, which the compiler turns into loads of whole packets; from indexed arrays it takes lane after lane. Each
 # operation is a statement, so that none is contracted.
 @wp.func_native(f"""
