@@ -30,6 +30,12 @@ LARGEST_RHO2 = wp.constant(wp.float64(36.0))
 LONGEST_STEP = wp.constant(wp.float64(0.25))
 
 sums = wp.types.vector(SUMS, wp.float64)
+# Pixels of a row side by side.
+LANES = 4
+# Powers of x in the sums of a row, from 0.
+POWERS = 5
+powers = wp.types.vector(POWERS, wp.float64)
+ratio_powers = wp.types.vector(6, wp.float64)
 
 
 @wp.struct
@@ -68,6 +74,111 @@ def first_pixel(low: wp.float64, count: wp.int32) -> wp.int32:
 def last_pixel(high: wp.float64, count: wp.int32) -> wp.int32:
     """Last pixel at or before a coordinate from the first pixel of the stamp."""
     return wp.int32(wp.floor(wp.clamp(high, wp.float64(-1.0), wp.float64(count - 1))))
+
+
+_ADD = f"""
+        for (int n = 0; n < {POWERS}; ++n) {{
+            sum[n] += values;
+            values *= x;
+        }}
+"""
+# Vectors of the compiler, which stay in the processor's registers.
+_ROW_LOOP = f"""
+    typedef double packet __attribute__((vector_size({8 * LANES}), aligned(8)));
+    typedef long long lanes __attribute__((vector_size({8 * LANES}), aligned(8)));
+    const double* image = row.data;
+    const lanes lane = {{0, 1, 2, 3}};
+    const double square = step * step;
+    const double second = weight * step;
+    packet weights = {{weight, second, weight * (square * ratio), second * (square * ratios.c[0])}};
+    packet steps = {{1.0, ratios.c[2], ratios.c[3], ratios.c[4]}};
+    steps *= square * square * ratios.c[1];
+    packet x = {{first_x, first_x + 1.0, first_x + 2.0, first_x + 3.0}};
+    packet sum[{POWERS}] = {{}};
+    int i = start;
+    for (; i + {LANES} <= end; i += {LANES}) {{
+        packet values = weights * *(const packet*)(image + i);
+        {_ADD}
+        weights *= steps;
+        steps *= ratios.c[5];
+        x += (double){LANES};
+    }}
+    if (i < end) {{
+        packet values = {{}};
+        if (i + {LANES} <= row.shape[0])
+            values = *(const packet*)(image + i);
+        else
+            for (int k = 0; k < row.shape[0] - i; ++k)
+                values[k] = image[i + k];
+        values = weights * (lane < end - i ? values : packet{{}});
+        {_ADD}
+    }}
+    wp::vec_t<{POWERS}, wp::float64> sums;
+    for (int n = 0; n < {POWERS}; ++n)
+        sums.c[n] = (sum[n][0] + sum[n][1]) + (sum[n][2] + sum[n][3]);
+    return sums;
+"""
+
+
+@wp.func_native(_ROW_LOOP)
+def sum_row(
+    row: wp.array(dtype=wp.float64),
+    start: wp.int32,
+    end: wp.int32,
+    first_x: wp.float64,
+    weight: wp.float64,
+    step: wp.float64,
+    ratio: wp.float64,
+    ratios: ratio_powers,
+) -> powers:
+    """Sum weight times pixel times powers of x over the pixels from the start to the end of a row.
+
+    Arguments: x of the first pixel, its weight, the ratio of the next one's to that, the ratio of such ratios, and that
+    to the powers 3, 6, 4, 8, 12 and 16: along a packet, and from one to the next.
+    """
+    ...
+
+
+@wp.func
+def sum_light(image: wp.array2d(dtype=wp.float64), ellipse: Ellipse) -> sums:
+    """Sum weight times image over the pixels within the ellipse, where none is masked."""
+    total = sums()
+    half = wp.float64(0.5)
+    two = wp.float64(2.0)
+    ny = image.shape[0]
+    nx = image.shape[1]
+    det = ellipse.xx * ellipse.yy - ellipse.xy * ellipse.xy
+    a = ellipse.yy / det
+    b = -ellipse.xy / det
+    c = ellipse.xx / det
+    # Along a row G is a Gaussian: its ratios of neighbours have a constant ratio.
+    ratio = wp.exp(-a)
+    cube = ratio * ratio * ratio
+    fourth = cube * ratio
+    eighth = fourth * fourth
+    ratios = ratio_powers(cube, cube * cube, fourth, eighth, eighth * fourth, eighth * eighth)
+    middle_y = half * wp.float64(ny - 1) + ellipse.y
+    middle_x = half * wp.float64(nx - 1) + ellipse.x
+    reach = wp.sqrt(LARGEST_RHO2 * ellipse.yy)
+    for j in range(first_pixel(middle_y - reach, ny), last_pixel(middle_y + reach, ny) + 1):
+        y = wp.float64(j) - middle_y
+        room = (LARGEST_RHO2 - y * y / ellipse.yy) / a
+        if room > wp.float64(0.0):
+            axis = -b * y / a
+            width = wp.sqrt(room)
+            start = first_pixel(middle_x + axis - width, nx)
+            end = last_pixel(middle_x + axis + width, nx) + 1
+            x = wp.float64(start) - middle_x
+            weight = wp.exp(-half * (a * x * x + two * b * x * y + c * y * y))
+            step = wp.exp(-half * a * (two * x + wp.float64(1.0)) - b * y)
+            row = sum_row(image[j], start, end, x, weight, step, ratio, ratios)
+            # rho^2 = a x^2 + p x + q
+            p = two * b * y
+            q = c * y * y
+            rho4 = a * a * row[4] + two * a * p * row[3] + (p * p + two * a * q) * row[2]
+            rho4 += q * (two * p * row[1] + q * row[0])
+            total += sums(row[0], row[1], row[0] * y, row[2], row[1] * y, row[0] * y * y, rho4)
+    return total
 
 
 @wp.func
@@ -124,7 +235,7 @@ def fit_ellipses(
     first: wp.int32,
     images: wp.array3d(dtype=wp.float64),
     mask: wp.array3d(dtype=wp.uint8),
-    masks: wp.bool,
+    masked: wp.array(dtype=wp.uint8),
     fill: wp.bool,
     start_sigma: wp.float64,
     max_iterations: wp.int32,
@@ -134,10 +245,12 @@ def fit_ellipses(
 ):
     """Iterate the ellipse of one image (Hirata & Seljak 2003, as GalSim's FindAdaptiveMom has it).
 
-    With `fill` a masked pixel holds what the Gaussian that fits the others best has there, else nothing.
+    With `fill` a masked pixel holds what the Gaussian that fits the others best has there, else nothing. `masked`
+    [image] tells whether one has such pixels; the mask has one image where none has.
     """
     item = first + wp.tid()
     image = images[item]
+    masks = masked[item] != wp.uint8(0)
     half_x = wp.float64(0.5) * wp.float64(image.shape[1] - 1)
     half_y = wp.float64(0.5) * wp.float64(image.shape[0] - 1)
     widest = wp.float64(image.shape[0] * image.shape[0] + image.shape[1] * image.shape[1])
@@ -154,7 +267,12 @@ def fit_ellipses(
     masked_part = zero
     iteration = wp.int32(0)
     while iteration < max_iterations and flag == NOT_CONVERGED:
-        stamp_sums = sum_stamp(image, mask[item], masks, ellipse)
+        stamp_sums = StampSums()
+        if masks:
+            stamp_sums = sum_stamp(image, mask[item], masks, ellipse)
+        else:
+            stamp_sums.light = sum_light(image, ellipse)
+            stamp_sums.squared_weight = wp.float64(1.0)
         total = stamp_sums.light
         if fill and stamp_sums.masked[0] > zero and stamp_sums.squared_weight > zero:
             total = total + (stamp_sums.light[0] / stamp_sums.squared_weight) * stamp_sums.masked

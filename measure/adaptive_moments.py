@@ -224,14 +224,14 @@ def adaptive_moments(
             bad |= ~(weights[rows] > 0.0)
         pixels[bad] = 0.0
         ellipses, flags = np.zeros((len(pixels), ELLIPSE)), np.zeros(len(pixels), dtype=np.int32)
-        has_masks = bool(bad.any())
+        in_stamp = bad.any(axis=(1, 2))
         launch(
             fit_ellipses,
             len(pixels),
             [
                 warp_array(pixels),
-                warp_array(bad if has_masks else np.zeros((len(pixels), 1, 1)), wp.uint8),
-                has_masks,
+                warp_array(bad if in_stamp.any() else np.zeros((len(pixels), 1, 1)), wp.uint8),
+                warp_array(in_stamp, wp.uint8),
                 fill_masked,
                 start,
                 max_iterations,

@@ -216,8 +216,9 @@ def transform_pupils(
     x, with their weights, and along y; wavelength [wave] [m]; rows [packet of columns]: their number; metric [star, 3]:
     xx, xy, yy of jacobian @ jacobian.T; table [wave, sample]: filter against the baseline; per_step [wave]: samples of
     the table per step of frequency, for a unit Jacobian; photons [star, wave], of mean 1; along_x and
-    along_y [star, packet, depth * n_point + point, 2]: room for cosines and sines of columns and rows; rims, meeting and sums [star, ...]: room for those of
-    ``add_rims``; spectrum [star, 4, row, packet]: real and imaginary parts at +n, and at -n.
+    along_y [star, packet, depth * n_point + point, 2]: room for cosines and sines of columns and rows; rims, meeting
+    and sums [star, ...]: room for those of ``add_rims``; spectrum [star, 4, row, packet]: real and imaginary parts at
+    +n, and at -n.
     """
     star = first + wp.tid()
     n_wave = wavelength.shape[0]
