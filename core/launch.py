@@ -118,6 +118,9 @@ def launch(
         return
     load_kernels(kernel, device)
     slices = min(thread_count(threads), count) if device == "cpu" and threads != 1 else 1
+    if slices == 1:
+        wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device)
+        return
 
     def run(i: int) -> None:
         first, end = (count * k // slices for k in (i, i + 1))

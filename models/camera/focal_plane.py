@@ -29,7 +29,6 @@ from .height_budget import (
     chosen_terms,
     draw_heights,
     load_budget,
-    term_heights,
 )
 from .height_fit import fit_heights, table_column
 from .height_map import HeightMap
@@ -264,7 +263,7 @@ class FocalPlane(HeightMap):
         if self.budget is None or self.seed is None:
             raise DomainError("factors of terms: expected a focal plane drawn from a height budget")
         parts = [
-            term_heights(self.camera, self.budget, self.seed, term).scaled(by_term.get(term, 1.0))
+            draw_heights(self.camera, self.budget, self.seed, (term,)).scaled(by_term.get(term, 1.0))
             for term in self.terms
         ]
         nothing = CcdSurfaces.level(self.camera.half_sizes)

@@ -94,13 +94,8 @@ def chosen_terms(terms: str | Iterable[str] | None) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=16)
-def term_heights(camera: Camera, budget: HeightBudget, seed: int, term: str) -> CcdSurfaces:
-    """Return the heights of one term, drawn once for sums that scale the terms."""
-    return draw_heights(camera, budget, seed, (term,))
-
-
 def draw_heights(camera: Camera, budget: HeightBudget, seed: int, terms: tuple[str, ...]) -> CcdSurfaces:
-    """Draw the heights of every CCD: the sum of the given terms, of `TERMS`."""
+    """Draw the heights of every CCD: the sum of the given terms, of `TERMS`. Visits of a night share them."""
     polynomial = np.zeros((len(camera), 10))
     waves = np.zeros((len(camera), 2, 4))
     for term, draw in _DRAWS.items():
