@@ -20,11 +20,15 @@ def sums_of_products(weights: np.ndarray, rows: np.ndarray, threads: int | None 
     count = rows.shape[1]
     if not (len(weights) and len(rows)):
         return np.zeros((len(weights), count))
-    packets = in_packets(rows)
+    return sums_of_packets(weights, in_packets(rows), threads)[:, :count]
+
+
+def sums_of_packets(weights: np.ndarray, packets: np.ndarray, threads: int | None = 1) -> np.ndarray:
+    """Return the sums of :func:`sums_of_products` over rows :func:`in_packets`, with what fills up the last one."""
     sums = np.empty((len(weights), len(packets), LANES))
     arrays = [warp_array(weights), warp_array(packets, columns), warp_array(sums, columns)]
     launch(add_products, len(packets), arrays, threads=threads)
-    return sums.reshape(len(weights), -1)[:, :count]
+    return sums.reshape(len(weights), -1)
 
 
 def in_packets(rows: np.ndarray) -> np.ndarray:

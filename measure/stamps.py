@@ -137,13 +137,18 @@ def center_stamps(
         stack = fill_symmetric(stack, bad, offsets[:, 0], offsets[:, 1])
     result = shift_to_middle(stack, offsets, size)
     if normalize:
-        total = result.reshape(count, -1).sum(axis=1)
-        result /= np.where(total > 0.0, total, np.nan)[:, None, None]
+        result = with_unit_sum(result)
     if masked.any():
         result[masked] = np.where(
             center_masks(bad[masked], offsets[masked, 0], offsets[masked, 1], size), np.nan, result[masked]
         )
     return result
+
+
+def with_unit_sum(stamps: np.ndarray) -> np.ndarray:
+    """Return stamps [n, ny, nx] over their sums; all NaN where that is not positive."""
+    total = stamps.reshape(len(stamps), -1).sum(axis=1)
+    return np.asarray(stamps / np.where(total > 0.0, total, np.nan)[:, None, None])
 
 
 def shift_to_middle(images: np.ndarray, offsets: np.ndarray, size: int) -> np.ndarray:

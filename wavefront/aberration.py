@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,6 +33,8 @@ from ..models.zernike_polynomials import annular_zernike_gradients, annular_zern
 PAPER_RMS = 0.2e-6
 #: Largest rms that can be drawn [m], ten times the paper's: beyond it the blur of 1.5 arcsec extends beyond the stamps.
 LARGEST_RMS = 10.0 * PAPER_RMS
+# Points of a pupil whose terms are stored.
+_FEW_POINTS = 1000
 #: Fraction of the variance, averaged over the field, that is linear in the field angle. Four sensors at the corners of
 #: a square within the field, of equal and independent errors, give a plane with as much variance in its slopes as in
 #: its mean.
@@ -177,9 +180,11 @@ class ResidualWavefront:
 
     def _basis(self, terms: Callable[..., np.ndarray], x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the terms or their derivatives from j = 4 on."""
-        radius = 0.5 * self.pupil_diameter
-        px, py = plane_points(x, y)
-        return terms(3 + len(self.coefficients), px / radius, py / radius, self.pupil_obscuration)[3:]
+        radius, last = 0.5 * self.pupil_diameter, 3 + len(self.coefficients)
+        px, py = (points / radius for points in plane_points(x, y))
+        if px.size <= _FEW_POINTS:
+            return _stored_terms(terms, last, px.tobytes(), py.tobytes(), px.shape, self.pupil_obscuration)[3:]
+        return terms(last, px, py, self.pupil_obscuration)[3:]
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,6 +206,16 @@ class StarWavefronts(ResidualWavefront):
         """Return the coefficients [m] at field slopes [..., 2] of the light's travel, shape [..., n_term]."""
         apart = np.asarray(slopes, dtype=np.float64)[..., None, :] - self.slopes
         return np.asarray(self.stars[np.argmin((apart**2).sum(axis=-1), axis=-1)])
+
+
+@lru_cache(maxsize=8)
+def _stored_terms(
+    terms: Callable[..., np.ndarray], last: int, x: bytes, y: bytes, shape: tuple[int, ...], obscuration: float
+) -> np.ndarray:
+    """Return terms at a few points, the same for all stars of an engine."""
+    values = terms(last, *(np.frombuffer(points).reshape(shape) for points in (x, y)), obscuration)
+    values.setflags(write=False)
+    return values
 
 
 def _sum_of_terms(coefficients: np.ndarray, basis: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...core.random_streams import stream
 from ...measure.shapes import Shapes, measure_shapes
-from ...measure.stamps import center_stamps, observe_stamps
+from ...measure.stamps import center_stamps, observe_stamps, with_unit_sum
 from ...measure.star_selection import StarFlag, flag_stars
 from ..experiment import Experiment
 from ..sensor.brighter_fatter import brighter_fatter
@@ -44,11 +44,11 @@ def observe_ccd(
         clean = observe_stamps(exposed, electrons, sky, noise, _stream(experiment, "noise", name))
         exposed, full_well = _with_defects(experiment, name, clean, exposed)
     first = measure_shapes(exposed, pixel_scale, experiment.weight_fwhm)
-    stamps = center_stamps(exposed, first.x, first.y, size=experiment.stamp_size)
+    centred = center_stamps(exposed, first.x, first.y, size=experiment.stamp_size, normalize=False)
+    stamps = with_unit_sum(centred)
     shapes = measure_shapes(stamps, pixel_scale, experiment.weight_fwhm)
     defects = np.zeros(len(stamps), dtype=np.int32)
     if noisy and config.reconstruction.flag_stars:
-        centred = center_stamps(exposed, first.x, first.y, size=experiment.stamp_size, normalize=False)
         defects = flag_stars(centred, np.hypot(np.sqrt(sky), noise)).flags
         if full_well is not None:
             # Pixels are compared with the full well before they are shifted.

@@ -16,14 +16,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import warp as wp
 
 from ...core.errors import DomainError
 from ...core.launch import launch
-from ...core.row_sums import sums_of_products
+from ...core.row_sums import in_packets, sums_of_packets, sums_of_products
 from ...core.threads import one_blas_thread
 from ...core.units import field_label
 from ...core.warp_arrays import warp_array
@@ -97,7 +97,7 @@ class FieldOptics:
             If a chief ray lands between the CCDs.
         """
         n_star, n_wave, n_pupil = len(slopes), len(self.wavelengths), len(self.pupil)
-        values = sums_of_products(_terms(slopes / self.reach), self.coefficients, threads)
+        values = sums_of_packets(_terms(slopes / self.reach), self._packets, threads)[:, : self.coefficients.shape[1]]
         chief, jacobian, rays, distances = np.split(values, np.cumsum([4, 4, 4 * n_wave * n_pupil]), axis=1)
         reference, steepness = self._land(fields, chief, focal_plane)
         jacobian = jacobian.reshape(-1, 2, 2)
@@ -132,6 +132,11 @@ class FieldOptics:
             fields=fields,
             wavelengths=self.wavelengths,
         ), edges
+
+    @cached_property
+    def _packets(self) -> np.ndarray:
+        """Coefficients in packets of values."""
+        return in_packets(self.coefficients)
 
     def turned(self, telescope: Telescope, angle: float) -> FieldOptics:
         """Return the polynomials of a telescope whose detector is turned by an angle [rad], from x towards y."""
@@ -179,8 +184,15 @@ def field_optics(telescope: Telescope, wavelengths: tuple[float, ...], pupil: Sp
 
     Those of the last few are stored, for any angle of the rotator.
     """
+    return _turned(telescope, wavelengths, len(pupil.radius), pupil.n_spoke)
+
+
+# Of one visit, through each of its pupils.
+@lru_cache(maxsize=4)
+def _turned(telescope: Telescope, wavelengths: tuple[float, ...], n_ring: int, n_spoke: int) -> FieldOptics | None:
+    """Return the polynomials of a telescope at any angle of the rotator."""
     unturned, angle = _without_rotator(telescope)
-    optics = _field_optics(unturned, wavelengths, len(pupil.radius), pupil.n_spoke)
+    optics = _field_optics(unturned, wavelengths, n_ring, n_spoke)
     return optics if optics is None or angle == 0.0 else optics.turned(telescope, angle)
 
 
@@ -205,7 +217,8 @@ def _without_rotator(telescope: Telescope) -> tuple[Telescope, float]:
     return replace(telescope, surfaces=(*telescope.surfaces[:-1], unturned)), angle
 
 
-@lru_cache(maxsize=8)
+# Of a night: six bands, through three pupils.
+@lru_cache(maxsize=18)
 def _field_optics(
     telescope: Telescope, wavelengths: tuple[float, ...], n_ring: int, n_spoke: int
 ) -> FieldOptics | None:

@@ -64,13 +64,9 @@ _LARGEST_LEFT = 1e-3
 # Part of the ring that is lit from which on rims cross few spokes. At 8 um of defocus e of the LSST is wrong by 1e-4 at
 # 0.8, by 1e-3 at 0.61.
 _LEAST_LIT = 0.75
-# Spokes and rings of stars that are lit less, and from which part on: e of the LSST is wrong by 1e-4 above 0.6, by 2e-4
-# with M2 10 um out of focus, its size by 1e-4; with the most spokes e by 5e-5 and its size by 1e-4. The lattice stands
-# for them below, where they would make e wrong by 3e-4 at 0.38.
-_DENSE = ((0.6, 64, 5), (0.5, 128, 6))
-# Kinds of stars beside those of so many rays: near focus; then each of _DENSE, from -1 downwards; and by the lattice.
+# Kinds of stars beside those of so many rays: near focus; then each of the denser pupils, from -1 downwards; and by the
+# lattice, after the last of them.
 _NEAR = 0
-_VIGNETTED = -1 - len(_DENSE)
 # Bytes of a point of the lattice and a wavelength.
 _LATTICE_BYTES = 24
 # Most stars of one batch.
@@ -126,6 +122,10 @@ class LongExposureRenderer(PsfRenderer):
     #: Largest transfer function of atmosphere and detector at a frequency that is left out; with pixels of 10 um all
     #: make 2e-6 of the peak of the image.
     negligible: ClassVar[float] = 1e-5
+    #: Denser pupils of stars that are lit less than :data:`_LEAST_LIT`: from which part on, spokes and rings. e of the
+    #: LSST is wrong by 1e-4 above 0.6, by 2e-4 with M2 10 um out of focus, its size by 1e-4; with the most spokes e by
+    #: 5e-5 and its size by 1e-4. The lattice stands for them below.
+    dense: ClassVar[tuple[tuple[float, int, int], ...]] = ((0.6, 64, 5), (0.5, 128, 6))
 
     def __init__(self, inputs: PsfInputs, options: LongExposureEngine) -> None:
         super().__init__(inputs)
@@ -235,7 +235,7 @@ class LongExposureRenderer(PsfRenderer):
             return self._expose_lattice(stars)
         optics, edges = self._near_optics(stars, self._pupil)
         lit = self._lit_fraction(edges)
-        bounds = np.array([_LEAST_LIT, *(least for least, _, _ in _DENSE)])
+        bounds = np.array([_LEAST_LIT, *(least for least, _, _ in self.dense)])
         kinds = _NEAR - (lit[:, None] < bounds).sum(axis=1)
         if self._options.n_pupil is None:
             rays = self._ray_counts(optics)
@@ -248,10 +248,10 @@ class LongExposureRenderer(PsfRenderer):
             """Expose stars of a kind: by strips, by a lattice or, far from focus, by a number of rays."""
             if kind == _NEAR:
                 return self._expose_spokes(optics.stars(near), edges[near], stars, self._pupil)
-            if kind == _VIGNETTED:
+            if kind == -1 - len(self.dense):
                 return self._expose_lattice(stars)
             if kind < _NEAR:
-                _, n_spoke, n_ring = _DENSE[-1 - kind]
+                _, n_spoke, n_ring = self.dense[-1 - kind]
                 return self._expose_dense(stars, n_spoke, n_ring)
             return self._expose_rays(kind, stars)
 
