@@ -279,7 +279,7 @@ def fit_ellipses(
     ellipses: wp.array2d(dtype=wp.float64),
     flags: wp.array(dtype=wp.int32),
 ):
-    """Find the ellipse of one image (Hirata & Seljak 2003, as GalSim's FindAdaptiveMom has it), in two thirds of the steps.
+    """Find the ellipse of one image (Hirata & Seljak 2003): that of GalSim's FindAdaptiveMom, in fewer steps.
 
     With `fill` a masked pixel holds what the Gaussian that fits the others best has there, else nothing. `masked`
     [image] tells whether one has such pixels; the mask has one image where none has.
