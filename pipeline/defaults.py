@@ -30,7 +30,7 @@ from ..raytrace.ideal_lens import require_image
 from ..reconstruction.psf_model.basis import COMPONENTS
 from ..wavefront.psf.engines import ENGINES
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
-from ..wavefront.psf.long_exposure import LongExposureEngine, default_points
+from ..wavefront.psf.long_exposure import LongExposureEngine
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .alignment_states import with_active_optics_state
 from .config import BandName, Configuration, PsfConfig, ReconstructionConfig
@@ -120,7 +120,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
         config.psf,
         (_WITH_ATMOSPHERE if atmosphere.enabled else _OPTICS_ALONE)
         | _stamp_geometry(config, telescope, camera)
-        | ({"n_pupil": default_points(telescope)} if _of_means(config.psf) else {}),
+        | _points_of_means(config.psf, telescope),
     )
     resolved = config.model_copy(
         update={
@@ -161,9 +161,10 @@ def _with_ground_wind(site: Site, wind: tuple[float, float] | None) -> Site:
     )
 
 
-def _of_means(psf: PsfConfig) -> bool:
-    """Return whether the engine's images are made of the mean over turbulence."""
-    return issubclass(ENGINES[psf.engine], LongExposureEngine)
+def _points_of_means(psf: PsfConfig, telescope: Telescope) -> dict[str, int]:
+    """Return the points of the pupil of engines whose images are made of the mean over turbulence."""
+    engine = ENGINES[psf.engine]
+    return {"n_pupil": engine.default_points(telescope)} if issubclass(engine, LongExposureEngine) else {}
 
 
 def _reconstruction(fit: ReconstructionConfig, weight_fwhm_arcsec: float) -> ReconstructionConfig:

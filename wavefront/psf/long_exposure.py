@@ -77,11 +77,6 @@ _BATCH_BYTES = 1 << 25
 _TABLE_SIZE = 2048
 
 
-def default_points(telescope: Telescope) -> int:
-    """Return the points of the pupil by default: of spokes where only discs and rings stop light, else of a lattice."""
-    return PUPIL_POINTS if has_only_annuli(telescope) else LATTICE_POINTS
-
-
 @check_arguments
 @dataclass(frozen=True)
 class LongExposureEngine(PsfEngine):
@@ -104,12 +99,19 @@ class LongExposureEngine(PsfEngine):
     name = "long_exposure"
     needs_atmosphere = True
     has_turbulence = False
+    #: Points on spokes by default.
+    spoke_points: ClassVar[int] = PUPIL_POINTS
 
     n_pupil: int | None = None
 
     def __post_init__(self) -> None:
         if self.n_pupil is not None:
             require_count(self.n_pupil, "n_pupil", 10)
+
+    @classmethod
+    def default_points(cls, telescope: Telescope) -> int:
+        """Return the points of the pupil by default: on spokes where only discs and rings stop light, else a lattice."""
+        return cls.spoke_points if has_only_annuli(telescope) else LATTICE_POINTS
 
     def _renderer(self, inputs: PsfInputs) -> LongExposureRenderer:
         return LongExposureRenderer(inputs, self)
@@ -149,7 +151,7 @@ class LongExposureRenderer(PsfRenderer):
             star_bytes = _LATTICE_BYTES * len(self._wavelengths) * len(self._lattice.points)
         else:
             self._tabulate_filter()
-            n_pupil = PUPIL_POINTS if options.n_pupil is None else options.n_pupil
+            n_pupil = options.spoke_points if options.n_pupil is None else options.n_pupil
             self._pupil = SpokePupil.fill(self._diameter, self._obscuration, n_pupil)
             star_bytes = 2 * 2 * 4 * LANES * self._detector.shape[2] * len(self._pupil.points) * self._channels.depths
         self.batch = max(1, min(_BATCH, _BATCH_BYTES // star_bytes))

@@ -68,7 +68,7 @@ class StatisticalEngine(LongExposureEngine):
     Attributes
     ----------
     n_pupil : int, optional
-        As in :class:`LongExposureEngine`.
+        As in :class:`LongExposureEngine`, but 60 points on spokes by default.
 
     Raises
     ------
@@ -78,6 +78,8 @@ class StatisticalEngine(LongExposureEngine):
 
     name = "statistical"
     has_turbulence = True
+    # 12 spokes of 5 rings: with 0.2 um of aberration e of the LSST is wrong by 2e-5 (rms), its size by 3e-5.
+    spoke_points = 60
 
     n_pupil: int | None = None
 

@@ -16,7 +16,7 @@ from pachon.wavefront.atmosphere.turbulence import diffraction_otf, structure_fu
 from pachon.wavefront.psf.engine import PsfInputs, Stars
 from pachon.wavefront.psf.image_plane import ImagePlane
 from pachon.wavefront.psf.lattice_pupil import FEWEST_POINTS, LatticeTransfer
-from pachon.wavefront.psf.long_exposure import LongExposureEngine, default_points
+from pachon.wavefront.psf.long_exposure import LongExposureEngine
 from pachon.wavefront.psf.mean_rays import MeanRaysRenderer
 from pachon.wavefront.psf.psf import make_psfs
 from pachon.wavefront.psf.stamps import Stamps
@@ -239,7 +239,8 @@ def test_dark_stars_and_points_asked_for(lsst_r):
     assert found.flags.tolist() == [1]
     assert not found.image.any()
     hsc = pachon.load_telescope("hsc")
-    assert (default_points(lsst_r), default_points(hsc)) == (80, 30000)
+    points = LongExposureEngine.default_points
+    assert (points(lsst_r), points(hsc)) == (80, 30000)
     with pytest.raises(pachon.PachonError, match=f"n_pupil = 80: expected .*{FEWEST_POINTS}"):
         renderer_for(hsc, 770e-9, COARSE, n_pupil=80)
 

@@ -93,7 +93,7 @@ def test_shapes_are_those_of_traced_stars(lsst, monkeypatch):
     interpolated = shapes()
     # Some stars beyond the polynomials, and none within.
     monkeypatch.setattr(field_optics_module, "_REACHES", (0.6,))
-    small = field_optics_module._field_optics.__wrapped__(lsst, WAVES, 5, 16)
+    small = field_optics_module._field_optics.__wrapped__(lsst, WAVES, 5, 12)
     monkeypatch.setattr(statistical, "field_optics", lambda *_: small)
     partly = shapes()
     monkeypatch.setattr(statistical, "field_optics", lambda *_: None)
