@@ -10,10 +10,10 @@ import warp as wp
 from ..core.buffers import empty
 from ..core.launch import launch
 from ..core.warp_arrays import warp_array
+from ..raytrace.kernels.opds import trace_opds
 from ..raytrace.kernels.packet import LANES, lane_flags, lanes, packet_count, ray_packets, to_packets
 from ..raytrace.pack.surfaces import indices_and_wavelength, leading_surfaces, pack_surfaces
 from ..raytrace.rays import object_points
-from .opd_kernels import trace_opds
 from .request import Request
 from .transmitted_packets import transmitted_packets
 

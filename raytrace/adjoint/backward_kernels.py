@@ -23,6 +23,8 @@ derivative by a motion ``v + w x r`` of a body is v.(force) + w.(torque) behind 
 
 from __future__ import annotations
 
+from functools import partial
+
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
@@ -294,11 +296,11 @@ def backward_loop(special: bool) -> wp.Function:
     return backward_through
 
 
-#: The loops of the variants of `kernel_pair`: rays that go back have no crossings to choose between.
-BACKWARD_LOOPS = (backward_loop(False), *[backward_loop(True)] * 2)
+#: The loops for plain telescopes and for any: rays that go back have no crossings to choose between.
+BACKWARD_LOOPS = (backward_loop(False), backward_loop(True))
 
 
-@kernel_pair
+@partial(kernel_pair, shared=__package__, chooses=False)
 def backward_rays(special: int, module: wp.Module) -> wp.Kernel:
     """Return the kernel of the backward pass."""
     backward_through = BACKWARD_LOOPS[special]

@@ -1,9 +1,8 @@
-"""Forward pass to reference spheres and backward pass in one kernel, packet by packet.
-
-A module of its own: with one caller of the surface loop in a module the compiler inlines all of it.
-"""
+"""Forward pass to reference spheres and backward pass in one kernel, packet by packet."""
 
 from __future__ import annotations
+
+from functools import partial
 
 import warp as wp
 
@@ -24,10 +23,11 @@ wp.set_module_options(FORWARD_OPTIONS)
 SPHERE_COLUMNS = 4
 
 
-@kernel_pair
+@partial(kernel_pair, shared=__package__, chooses=False)
 def sphere_paths(special: int, module: wp.Module) -> wp.Kernel:
     """Return the kernel of both passes."""
-    through_telescope = LOOPS[special]
+    # One of any telescope and of apertures that choose: it takes twice as long to compile as other kernels.
+    through_telescope = LOOPS[2 * special]
     backward_through = BACKWARD_LOOPS[special]
 
     @wp.kernel(module=module)

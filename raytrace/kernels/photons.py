@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
@@ -14,7 +16,7 @@ from .trace import CHROMATIC_LOOPS, statuses
 wp.set_module_options(FORWARD_OPTIONS)
 
 
-@kernel_pair
+@partial(kernel_pair, chooses=False)
 def trace_photons(special: int, module: wp.Module) -> wp.Kernel:
     """Return the kernel that traces photons."""
     through_telescope = CHROMATIC_LOOPS[special]

@@ -1,10 +1,8 @@
-"""The kernel that traces the same pupil points for many stars, to displacements and paths at the image.
-
-A module of its own: with one caller of the surface loop in a module the compiler inlines all of it, which saves a
-tenth of the time.
-"""
+"""The kernel that traces the same pupil points for many stars, to displacements and paths at the image."""
 
 from __future__ import annotations
+
+from functools import partial
 
 import warp as wp
 
@@ -40,7 +38,7 @@ def direction_from_point(px: lanes, py: lanes, pz: wp.float64, x: wp.float64, y:
     return wp.cw_mul(scale, du), wp.cw_mul(scale, dv), wp.cw_mul(scale, dw)
 
 
-@kernel_pair
+@partial(kernel_pair, shared=__package__)
 def trace_pupils(special: int, module: wp.Module) -> wp.Kernel:
     """Return the kernel that traces pupils."""
     through_telescope = LOOPS[special]

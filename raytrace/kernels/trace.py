@@ -6,6 +6,7 @@ is of that kind, because it takes registers and prevents the compiler from inlin
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import warp as wp
@@ -321,12 +322,12 @@ def surface_loop(special: int, chromatic: bool = False) -> wp.Function:
     return through_telescope
 
 
-#: The loops of the variants of `kernel_pair`; the same for rays of a wavelength each.
+#: The loops of the variants of `kernel_pair`; and for rays of a wavelength each for plain telescopes, and for any.
 LOOPS = (surface_loop(0), surface_loop(1), surface_loop(2))
-CHROMATIC_LOOPS = tuple(surface_loop(special, chromatic=True) for special in range(3))
+CHROMATIC_LOOPS = (surface_loop(0, chromatic=True), surface_loop(2, chromatic=True))
 
 
-@kernel_pair
+@partial(kernel_pair, shared=__package__)
 def trace_rays(special: int, module: wp.Module) -> wp.Kernel:
     """Return the kernel that traces given rays."""
     through_telescope = LOOPS[special]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
@@ -44,7 +46,7 @@ def scheduled_channel(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp
     return channel[wave, t, packet]
 
 
-@kernel_pair
+@partial(kernel_pair, chooses=False)
 def deposit_rays(special: int, module: wp.Module) -> wp.Kernel:
     """Return the kernel that deposits rays; the special one is that of wavelengths with several channels."""
     channel_of = scheduled_channel if special else single_channel

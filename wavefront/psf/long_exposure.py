@@ -110,7 +110,7 @@ class LongExposureEngine(PsfEngine):
 
     @classmethod
     def default_points(cls, telescope: Telescope) -> int:
-        """Return the points of the pupil by default: on spokes if only discs and rings stop light, else of a lattice."""
+        """Return the points by default: on spokes where only discs and rings stop light, else of a lattice."""
         return cls.spoke_points if has_only_annuli(telescope) else LATTICE_POINTS
 
     def _renderer(self, inputs: PsfInputs) -> LongExposureRenderer:

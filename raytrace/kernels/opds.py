@@ -1,25 +1,24 @@
-"""Kernel that traces the pupil of many field points and stores nothing but optical path differences.
-
-Its module has no other kernel: the compiler inlines the surface loop where it has one caller in a module.
-"""
+"""The kernel that traces the pupil of many field points and stores nothing but optical path differences."""
 
 from __future__ import annotations
 
+from functools import partial
+
 import warp as wp
 
-from ..core.launch import FORWARD_OPTIONS
-from ..raytrace.kernels.kernel_pair import kernel_pair
-from ..raytrace.kernels.packet import LANES, RayPackets, lane_flags, lanes
-from ..raytrace.kernels.pupil import direction_from_point, plane_wave_start
-from ..raytrace.kernels.sphere import sphere_distance
-from ..raytrace.kernels.surface import OK, ZERO
-from ..raytrace.kernels.surface_table import PackedSurfaces
-from ..raytrace.kernels.trace import LOOPS
+from ...core.launch import FORWARD_OPTIONS
+from .kernel_pair import kernel_pair
+from .packet import LANES, RayPackets, lane_flags, lanes
+from .pupil import direction_from_point, plane_wave_start
+from .sphere import sphere_distance
+from .surface import OK, ZERO
+from .surface_table import PackedSurfaces
+from .trace import LOOPS
 
 wp.set_module_options(FORWARD_OPTIONS)
 
 
-@kernel_pair
+@partial(kernel_pair, shared=__package__)
 def trace_opds(special: int, module: wp.Module) -> wp.Kernel:
     """Return the kernel that traces optical path differences."""
     through_telescope = LOOPS[special]
