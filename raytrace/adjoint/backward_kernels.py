@@ -296,12 +296,12 @@ def backward_loop(special: bool) -> wp.Function:
     return backward_through
 
 
-#: The loops for plain telescopes and for any: rays that go back have no crossings to choose between.
+#: The loops of the variants of `kernel_pair`.
 BACKWARD_LOOPS = (backward_loop(False), backward_loop(True))
 
 
-@partial(kernel_pair, shared=__package__, chooses=False)
-def backward_rays(special: int, module: wp.Module) -> wp.Kernel:
+@partial(kernel_pair, shared=__package__)
+def backward_rays(special: bool, module: wp.Module) -> wp.Kernel:
     """Return the kernel of the backward pass."""
     backward_through = BACKWARD_LOOPS[special]
 

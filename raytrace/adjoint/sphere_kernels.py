@@ -23,11 +23,10 @@ wp.set_module_options(FORWARD_OPTIONS)
 SPHERE_COLUMNS = 4
 
 
-@partial(kernel_pair, shared=__package__, chooses=False)
-def sphere_paths(special: int, module: wp.Module) -> wp.Kernel:
+@partial(kernel_pair, shared=__package__)
+def sphere_paths(special: bool, module: wp.Module) -> wp.Kernel:
     """Return the kernel of both passes."""
-    # One of any telescope and of apertures that choose: it takes twice as long to compile as other kernels.
-    through_telescope = LOOPS[2 * special]
+    through_telescope = LOOPS[special]
     backward_through = BACKWARD_LOOPS[special]
 
     @wp.kernel(module=module)

@@ -19,7 +19,7 @@ wp.set_module_options(FORWARD_OPTIONS)
 
 
 @partial(kernel_pair, shared=__package__)
-def trace_opds(special: int, module: wp.Module) -> wp.Kernel:
+def trace_opds(special: bool, module: wp.Module) -> wp.Kernel:
     """Return the kernel that traces optical path differences."""
     through_telescope = LOOPS[special]
 

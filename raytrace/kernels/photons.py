@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
@@ -16,8 +14,8 @@ from .trace import CHROMATIC_LOOPS, statuses
 wp.set_module_options(FORWARD_OPTIONS)
 
 
-@partial(kernel_pair, chooses=False)
-def trace_photons(special: int, module: wp.Module) -> wp.Kernel:
+@kernel_pair
+def trace_photons(special: bool, module: wp.Module) -> wp.Kernel:
     """Return the kernel that traces photons."""
     through_telescope = CHROMATIC_LOOPS[special]
 

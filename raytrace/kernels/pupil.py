@@ -39,7 +39,7 @@ def direction_from_point(px: lanes, py: lanes, pz: wp.float64, x: wp.float64, y:
 
 
 @partial(kernel_pair, shared=__package__)
-def trace_pupils(special: int, module: wp.Module) -> wp.Kernel:
+def trace_pupils(special: bool, module: wp.Module) -> wp.Kernel:
     """Return the kernel that traces pupils."""
     through_telescope = LOOPS[special]
 

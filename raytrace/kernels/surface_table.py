@@ -63,11 +63,10 @@ KINDS = 10
 class PackedSurfaces:
     """A telescope as tables, a row per surface; see :mod:`pachon.raytrace.pack.surfaces`.
 
-    ``special`` is 1 where the loop over its surfaces needs more than the plain one has, 2 where apertures choose
-    between crossings.
+    ``special`` tells whether the loop over its surfaces needs more than the plain one has.
     """
 
-    special: wp.int32
+    special: wp.bool
     numbers: wp.array2d(dtype=wp.float64)
     kinds: wp.array2d(dtype=wp.int32)
     coefficients: wp.array2d(dtype=wp.float64)

@@ -100,13 +100,13 @@ def statuses(status: lanes):
     return out
 
 
-def surface_loop(special: int, chromatic: bool = False) -> wp.Function:
-    """Return the loop over the surfaces of a telescope: plain (0), any (1), any with a choice of crossings (2).
+def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
+    """Return the loop over the surfaces of a telescope, of plain ones or of any.
 
-    Plain telescopes have conics with even powers, discs and rings as apertures, no phase screens, gratings, thin lenses
-    or obstructions. The ``indices`` are a row of numbers, before the first surface and after each, and the wavelength
-    [m] as the last of the row; in a chromatic loop, where every ray has its own wavelength, packets of indices
-    [medium, packet] and of the wavelength behind them, and optical paths are left out.
+    Plain telescopes have conics with even powers, discs and rings as apertures that choose between no crossings, no
+    phase screens, gratings, thin lenses or obstructions. The ``indices`` are a row of numbers, before the first surface
+    and after each, and the wavelength [m] as the last of the row; in a chromatic loop, where every ray has its own
+    wavelength, packets of indices [medium, packet] and of the wavelength behind them, and optical paths are left out.
     """
 
     @wp.func
@@ -149,7 +149,7 @@ def surface_loop(special: int, chromatic: bool = False) -> wp.Function:
             terms = surfaces.kinds[s, TERMS]
             first_curvature = surfaces.numbers[s, FIRST_CURVATURE]
             t = conic_distance(first_curvature, k, surfaces.numbers[s, SIGN_CHANGE], x, y, z, u, v, w)
-            if wp.static(special == 2):
+            if wp.static(special):
                 if surfaces.kinds[s, CHOSEN] > 0:
                     if reaches_twice(w, surfaces.numbers[s, TWO_CROSSINGS]):
                         t = start_by_aperture(surfaces, s, x, y, z, u, v, w, t)
@@ -322,13 +322,13 @@ def surface_loop(special: int, chromatic: bool = False) -> wp.Function:
     return through_telescope
 
 
-#: The loops of the variants of `kernel_pair`; and for rays of a wavelength each for plain telescopes, and for any.
-LOOPS = (surface_loop(0), surface_loop(1), surface_loop(2))
-CHROMATIC_LOOPS = (surface_loop(0, chromatic=True), surface_loop(2, chromatic=True))
+#: The loops of the variants of `kernel_pair`; the same for rays of a wavelength each.
+LOOPS = (surface_loop(False), surface_loop(True))
+CHROMATIC_LOOPS = (surface_loop(False, chromatic=True), surface_loop(True, chromatic=True))
 
 
 @partial(kernel_pair, shared=__package__)
-def trace_rays(special: int, module: wp.Module) -> wp.Kernel:
+def trace_rays(special: bool, module: wp.Module) -> wp.Kernel:
     """Return the kernel that traces given rays."""
     through_telescope = LOOPS[special]
 

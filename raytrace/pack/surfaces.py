@@ -188,9 +188,9 @@ def pack_surfaces(telescope: Telescope | SurfaceSequence, device: str = "cpu") -
         ]
         before = s.medium_after
     packed = PackedSurfaces()
-    unusual = kinds[:, [DEFORMED, OBSTRUCTED, RULED]].any() or np.any(kinds[:, STOPPED] == 2)
+    unusual = kinds[:, [DEFORMED, OBSTRUCTED, RULED, CHOSEN]].any() or np.any(kinds[:, STOPPED] == 2)
     unusual = unusual or np.isin(kinds[:, INTERACTION], (PHASE, THIN_LENS)).any()
-    packed.special = 2 if kinds[:, CHOSEN].any() else int(unusual)
+    packed.special = bool(unusual)
     packed.numbers = warp_array(numbers, device=device)
     packed.kinds = warp_array(kinds, wp.int32, device=device)
     packed.coefficients = warp_array(coefficients, device=device)

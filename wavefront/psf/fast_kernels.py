@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
@@ -46,8 +44,8 @@ def scheduled_channel(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp
     return channel[wave, t, packet]
 
 
-@partial(kernel_pair, chooses=False)
-def deposit_rays(special: int, module: wp.Module) -> wp.Kernel:
+@kernel_pair
+def deposit_rays(special: bool, module: wp.Module) -> wp.Kernel:
     """Return the kernel that deposits rays; the special one is that of wavelengths with several channels."""
     channel_of = scheduled_channel if special else single_channel
 
