@@ -161,7 +161,7 @@ def _with_ground_wind(site: Site, wind: tuple[float, float] | None) -> Site:
     )
 
 
-def _points_of_means(psf: PsfConfig, telescope: Telescope) -> dict[str, int]:
+def _points_of_means(psf: PsfConfig, telescope: Telescope) -> dict[str, float]:
     """Return the points of the pupil of engines whose images are made of the mean over turbulence."""
     engine = ENGINES[psf.engine]
     return {"n_pupil": engine.default_points(telescope)} if issubclass(engine, LongExposureEngine) else {}
