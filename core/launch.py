@@ -118,9 +118,6 @@ def launch(
         return
     load_kernels(kernel, device)
     slices = min(thread_count(threads), count) if device == "cpu" and threads != 1 else 1
-    if slices == 1:
-        wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device)
-        return
 
     def run(i: int) -> None:
         first, end = (count * k // slices for k in (i, i + 1))
@@ -130,6 +127,7 @@ def launch(
     try:
         run(0)
     finally:
-        wait(others)
+        if others:
+            wait(others)
     for other in others:
         other.result()

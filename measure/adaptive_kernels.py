@@ -141,42 +141,99 @@ def sum_row(
     ...
 
 
+@wp.struct
+class Gaussian:
+    """The weight of an ellipse on a stamp: rho^2 = a x^2 + 2 b x y + c y^2 from its middle."""
+
+    a: wp.float64
+    b: wp.float64
+    c: wp.float64
+    ratio: wp.float64  # of the ratios of neighbours along a row, which is constant
+    middle_x: wp.float64  # from the first pixel of the stamp
+    middle_y: wp.float64
+    yy: wp.float64
+
+
+@wp.struct
+class RowSpan:
+    """Pixels of a row within the ellipse: from the first, at x from the middle, with its weight, to the end."""
+
+    start: wp.int32
+    end: wp.int32
+    x: wp.float64
+    weight: wp.float64
+    step: wp.float64  # ratio of the next weight to the first
+
+
+@wp.func
+def gaussian_of(ellipse: Ellipse, ny: wp.int32, nx: wp.int32) -> Gaussian:
+    """Weight of an ellipse on a stamp of ny by nx pixels."""
+    half = wp.float64(0.5)
+    det = ellipse.xx * ellipse.yy - ellipse.xy * ellipse.xy
+    gaussian = Gaussian()
+    gaussian.a = ellipse.yy / det
+    gaussian.b = -ellipse.xy / det
+    gaussian.c = ellipse.xx / det
+    gaussian.ratio = wp.exp(-gaussian.a)
+    gaussian.middle_y = half * wp.float64(ny - 1) + ellipse.y
+    gaussian.middle_x = half * wp.float64(nx - 1) + ellipse.x
+    gaussian.yy = ellipse.yy
+    return gaussian
+
+
+@wp.func
+def first_row(gaussian: Gaussian, ny: wp.int32) -> wp.int32:
+    """First row within the ellipse."""
+    return first_pixel(gaussian.middle_y - wp.sqrt(LARGEST_RHO2 * gaussian.yy), ny)
+
+
+@wp.func
+def last_row(gaussian: Gaussian, ny: wp.int32) -> wp.int32:
+    """Last row within the ellipse."""
+    return last_pixel(gaussian.middle_y + wp.sqrt(LARGEST_RHO2 * gaussian.yy), ny)
+
+
+@wp.func
+def row_span(gaussian: Gaussian, y: wp.float64, nx: wp.int32) -> RowSpan:
+    """Pixels of the row at y from the middle that lie within the ellipse; none where it ends before."""
+    half = wp.float64(0.5)
+    two = wp.float64(2.0)
+    a = gaussian.a
+    b = gaussian.b
+    span = RowSpan()
+    room = (LARGEST_RHO2 - y * y / gaussian.yy) / a
+    if room > wp.float64(0.0):
+        axis = -b * y / a
+        width = wp.sqrt(room)
+        span.start = first_pixel(gaussian.middle_x + axis - width, nx)
+        span.end = last_pixel(gaussian.middle_x + axis + width, nx) + 1
+        span.x = wp.float64(span.start) - gaussian.middle_x
+        span.weight = wp.exp(-half * (a * span.x * span.x + two * b * span.x * y + gaussian.c * y * y))
+        span.step = wp.exp(-half * a * (two * span.x + wp.float64(1.0)) - b * y)
+    return span
+
+
 @wp.func
 def sum_light(image: wp.array2d(dtype=wp.float64), ellipse: Ellipse) -> sums:
     """Sum weight times image over the pixels within the ellipse, where none is masked."""
     total = sums()
-    half = wp.float64(0.5)
     two = wp.float64(2.0)
     ny = image.shape[0]
-    nx = image.shape[1]
-    det = ellipse.xx * ellipse.yy - ellipse.xy * ellipse.xy
-    a = ellipse.yy / det
-    b = -ellipse.xy / det
-    c = ellipse.xx / det
-    # Along a row G is a Gaussian: its ratios of neighbours have a constant ratio.
-    ratio = wp.exp(-a)
+    gaussian = gaussian_of(ellipse, ny, image.shape[1])
+    a = gaussian.a
+    ratio = gaussian.ratio
     cube = ratio * ratio * ratio
     fourth = cube * ratio
     eighth = fourth * fourth
     ratios = ratio_powers(cube, cube * cube, fourth, eighth, eighth * fourth, eighth * eighth)
-    middle_y = half * wp.float64(ny - 1) + ellipse.y
-    middle_x = half * wp.float64(nx - 1) + ellipse.x
-    reach = wp.sqrt(LARGEST_RHO2 * ellipse.yy)
-    for j in range(first_pixel(middle_y - reach, ny), last_pixel(middle_y + reach, ny) + 1):
-        y = wp.float64(j) - middle_y
-        room = (LARGEST_RHO2 - y * y / ellipse.yy) / a
-        if room > wp.float64(0.0):
-            axis = -b * y / a
-            width = wp.sqrt(room)
-            start = first_pixel(middle_x + axis - width, nx)
-            end = last_pixel(middle_x + axis + width, nx) + 1
-            x = wp.float64(start) - middle_x
-            weight = wp.exp(-half * (a * x * x + two * b * x * y + c * y * y))
-            step = wp.exp(-half * a * (two * x + wp.float64(1.0)) - b * y)
-            row = sum_row(image[j], start, end, x, weight, step, ratio, ratios)
+    for j in range(first_row(gaussian, ny), last_row(gaussian, ny) + 1):
+        y = wp.float64(j) - gaussian.middle_y
+        span = row_span(gaussian, y, image.shape[1])
+        if span.end > span.start:
+            row = sum_row(image[j], span.start, span.end, span.x, span.weight, span.step, ratio, ratios)
             # rho^2 = a x^2 + p x + q
-            p = two * b * y
-            q = c * y * y
+            p = two * gaussian.b * y
+            q = gaussian.c * y * y
             rho4 = a * a * row[4] + two * a * p * row[3] + (p * p + two * a * q) * row[2]
             rho4 += q * (two * p * row[1] + q * row[0])
             total += sums(row[0], row[1], row[0] * y, row[2], row[1] * y, row[0] * y * y, rho4)
@@ -184,45 +241,31 @@ def sum_light(image: wp.array2d(dtype=wp.float64), ellipse: Ellipse) -> sums:
 
 
 @wp.func
-def sum_stamp(
-    image: wp.array2d(dtype=wp.float64), mask: wp.array2d(dtype=wp.uint8), masks: wp.bool, ellipse: Ellipse
-) -> StampSums:
-    """Sum weight times image, and squares of the weight, over the pixels within the ellipse."""
+def sum_stamp(image: wp.array2d(dtype=wp.float64), mask: wp.array2d(dtype=wp.uint8), ellipse: Ellipse) -> StampSums:
+    """Sum weight times image, and squares of the weight, over the pixels within the ellipse, masked ones apart."""
     result = StampSums()
-    half = wp.float64(0.5)
     ny = image.shape[0]
-    nx = image.shape[1]
-    det = ellipse.xx * ellipse.yy - ellipse.xy * ellipse.xy
-    a = ellipse.yy / det
-    b = -ellipse.xy / det
-    c = ellipse.xx / det
-    # Along a row G is a Gaussian: its ratios of neighbours have a constant ratio.
-    ratio = wp.exp(-a)
-    middle_y = half * wp.float64(ny - 1) + ellipse.y
-    middle_x = half * wp.float64(nx - 1) + ellipse.x
-    reach = wp.sqrt(LARGEST_RHO2 * ellipse.yy)
-    for j in range(first_pixel(middle_y - reach, ny), last_pixel(middle_y + reach, ny) + 1):
-        y = wp.float64(j) - middle_y
-        room = (LARGEST_RHO2 - y * y / ellipse.yy) / a
-        if room > wp.float64(0.0):
-            axis = -b * y / a
-            width = wp.sqrt(room)
-            start = first_pixel(middle_x + axis - width, nx)
-            end = last_pixel(middle_x + axis + width, nx) + 1
-            x = wp.float64(start) - middle_x
-            weight = wp.exp(-half * (a * x * x + wp.float64(2.0) * b * x * y + c * y * y))
-            step = wp.exp(-half * a * (wp.float64(2.0) * x + wp.float64(1.0)) - b * y)
-            for i in range(start, end):
-                rho2 = a * x * x + wp.float64(2.0) * b * x * y + c * y * y
-                factors = products(x, y, rho2)
-                if masks and mask[j, i] != wp.uint8(0):
-                    result.masked += weight * weight * factors
-                else:
-                    result.light += weight * image[j, i] * factors
-                    result.squared_weight += weight * weight
-                weight = weight * step
-                step = step * ratio
-                x = x + wp.float64(1.0)
+    gaussian = gaussian_of(ellipse, ny, image.shape[1])
+    a = gaussian.a
+    b = gaussian.b
+    c = gaussian.c
+    for j in range(first_row(gaussian, ny), last_row(gaussian, ny) + 1):
+        y = wp.float64(j) - gaussian.middle_y
+        span = row_span(gaussian, y, image.shape[1])
+        x = span.x
+        weight = span.weight
+        step = span.step
+        for i in range(span.start, span.end):
+            rho2 = a * x * x + wp.float64(2.0) * b * x * y + c * y * y
+            factors = products(x, y, rho2)
+            if mask[j, i] != wp.uint8(0):
+                result.masked += weight * weight * factors
+            else:
+                result.light += weight * image[j, i] * factors
+                result.squared_weight += weight * weight
+            weight = weight * step
+            step = step * gaussian.ratio
+            x = x + wp.float64(1.0)
     return result
 
 
@@ -307,7 +350,7 @@ def fit_ellipses(
     while iteration < max_iterations and flag == NOT_CONVERGED:
         stamp_sums = StampSums()
         if masks:
-            stamp_sums = sum_stamp(image, mask[item], masks, ellipse)
+            stamp_sums = sum_stamp(image, mask[item], ellipse)
         else:
             stamp_sums.light = sum_light(image, ellipse)
             stamp_sums.squared_weight = wp.float64(1.0)

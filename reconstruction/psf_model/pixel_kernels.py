@@ -40,7 +40,7 @@ _ADD = f"""
     for (int from = 0; from < {LANES}; from += {_COLUMNS}) {{
         const double* square = (const double*)squares.data + from;
         const part scale = *(const part*)(scales.c + from);
-        const part one = 1.0 - 0.0 * scale;
+        const part one = 1.0 - part{{}};
         part product = one, sum = {{}};
         for (int axis = start; axis < end; ++axis) {{
             const part signal = scale * spectrum.data[axis];

@@ -16,19 +16,11 @@ wp.set_module_options(FORWARD_OPTIONS)
 #: Numbers of a rim at one wavelength: its strip's part of the pupil per step of frequency, along x and y; the phase of
 #: the strip over that part, per step, along x and y; and the light of its point.
 RIM_NUMBERS = 5
-# Lanes whose sums stay in registers together; of rims, whose sums need more of them, and of the points between.
+# Lanes of rims whose sums, which are more than those of other points, stay in registers together.
 _RIM_LANES = LANES // 2
-_INNER_LANES = LANES
 
-_INNER_LOOP = f"""
-    typedef float packet __attribute__((vector_size({4 * _INNER_LANES}), aligned(4)));
-    float* sum = (float*)sums.data;
-    for (int from = 0; from < {LANES}; from += {_INNER_LANES}) {{
-        const float* x = (const float*)along_x.data + from;
-        const float* y = (const float*)along_y.data + row % {LANES};
-        packet cc = {{}}, ss = {{}}, cs = {{}}, sc = {{}};
-        for (int depth = 0; depth < n_depth; ++depth)
-            for (int point = depth * n_point + n_spoke; point < (depth + 1) * n_point - n_spoke; ++point) {{
+# Products of cosines and sines along x (a, b) and y (c, d) of a point.
+_PRODUCTS = f"""
                 const packet a = *(const packet*)(x + 2 * {LANES} * point);
                 const packet b = *(const packet*)(x + 2 * {LANES} * point + {LANES});
                 const float c = y[2 * {LANES} * point];
@@ -37,17 +29,26 @@ _INNER_LOOP = f"""
                 const packet db = d * b;
                 const packet da = d * a;
                 const packet cb = c * b;
-                cc = cc + ca;
-                ss = ss + db;
-                cs = cs + da;
-                sc = sc + cb;
-            }}
-        // At -row the sine along y has the other sign.
-        *(packet*)(sum + from) = cc - ss;
-        *(packet*)(sum + {LANES} + from) = cs + sc;
-        *(packet*)(sum + {2 * LANES} + from) = cc + ss;
-        *(packet*)(sum + {3 * LANES} + from) = sc - cs;
-    }}
+"""
+_INNER_LOOP = f"""
+    typedef float packet __attribute__((vector_size({4 * LANES}), aligned(4)));
+    const float* x = (const float*)along_x.data;
+    const float* y = (const float*)along_y.data + row % {LANES};
+    packet cc = {{}}, ss = {{}}, cs = {{}}, sc = {{}};
+    for (int depth = 0; depth < n_depth; ++depth)
+        for (int point = depth * n_point + n_spoke; point < (depth + 1) * n_point - n_spoke; ++point) {{
+            {_PRODUCTS}
+            cc = cc + ca;
+            ss = ss + db;
+            cs = cs + da;
+            sc = sc + cb;
+        }}
+    // At -row the sine along y has the other sign.
+    packet* sum = (packet*)sums.data;
+    sum[0] = cc - ss;
+    sum[1] = cs + sc;
+    sum[2] = cc + ss;
+    sum[3] = sc - cs;
 """
 _RIM_LOOP = f"""
     typedef float packet __attribute__((vector_size({4 * _RIM_LANES}), aligned(4)));
@@ -56,11 +57,11 @@ _RIM_LOOP = f"""
     for (int from = 0; from < {LANES}; from += {_RIM_LANES}) {{
         const float* x = (const float*)along_x.data + from;
         const float* y = (const float*)along_y.data + row % {LANES};
-        packet column, tiny;
-        for (int i = 0; i < {_RIM_LANES}; ++i) {{
+        const packet one = 1.0f - packet{{}};
+        const packet tiny = 1e-20f - packet{{}};
+        packet column;
+        for (int i = 0; i < {_RIM_LANES}; ++i)
             column[i] = (float)(first_column + from + i);
-            tiny[i] = 1e-20f;
-        }}
         packet re_plus = *(packet*)(sum + from);
         packet im_plus = *(packet*)(sum + {LANES} + from);
         packet re_minus = *(packet*)(sum + {2 * LANES} + from);
@@ -69,14 +70,7 @@ _RIM_LOOP = f"""
             int point = rim < n_spoke ? rim : rim + n_point - 2 * n_spoke;
             packet cc, ss, cs, sc;
             for (int depth = 0; depth < n_depth; ++depth) {{
-                const packet a = *(const packet*)(x + 2 * {LANES} * point);
-                const packet b = *(const packet*)(x + 2 * {LANES} * point + {LANES});
-                const float c = y[2 * {LANES} * point];
-                const float d = y[2 * {LANES} * point + {LANES}];
-                const packet ca = c * a;
-                const packet db = d * b;
-                const packet da = d * a;
-                const packet cb = c * b;
+                {_PRODUCTS}
                 cc = depth ? cc + ca : ca;
                 ss = depth ? ss + db : db;
                 cs = depth ? cs + da : da;
@@ -100,7 +94,6 @@ _RIM_LOOP = f"""
                 const packet both_minus = minus + __builtin_elementwise_abs(opposite_x - opposite_y);
                 const packet part_plus = whole / __builtin_elementwise_max(both_plus, tiny);
                 const packet part_minus = whole / __builtin_elementwise_max(both_minus, tiny);
-                const packet one = 1.0f - 0.0f * column;
                 plus = plus * __builtin_elementwise_min(one, part_plus);
                 minus = minus * __builtin_elementwise_min(one, part_minus);
             }}
