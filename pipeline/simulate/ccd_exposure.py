@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.groups import slices_of
 from ...measure.shapes import measure_shapes
 from ...models.camera.camera import Camera
 from ...models.ideal_telescope import ideal_telescope
@@ -144,7 +145,7 @@ def expose_ccds(
             experiment, groups, threads, progress, offsets=offsets, room=_SHIFT_ROOM, temperatures=kelvin
         )
     exposures = []
-    of_holdout, of_observed = (_slices(parts) for parts in (holdout_groups, groups))
+    of_holdout, of_observed = (slices_of(parts) for parts in (holdout_groups, groups))
     for (name, field), first, second in zip(stars.items(), of_holdout, of_observed, strict=True):
         exposures.append(
             CcdExposure(
@@ -156,12 +157,6 @@ def expose_ccds(
             )
         )
     return exposures
-
-
-def _slices(groups: Sequence[np.ndarray]) -> list[slice]:
-    """Return the slice of each group in their concatenation."""
-    ends = np.cumsum([len(group) for group in groups]).tolist()
-    return [slice(end - len(group), end) for end, group in zip(ends, groups, strict=True)]
 
 
 def _temperatures(fields: Sequence[StarField]) -> np.ndarray | None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from ...core.errors import PachonError, attempt
+from ...core.groups import rows_of, slices_of
 from ...core.statistics import FWHM_PER_RMS
 from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
 from ...measure.shapes import Shapes, fwhm, measure_shapes
@@ -21,7 +22,7 @@ from ...sky.sky_shapes import along_sky
 from ..experiment import Experiment
 from ..resolved_values import least_star_count, noise_free_components
 from .ccd_exposure import CcdExposure, ccd_stars
-from .ccd_observation import Observation, collected_images, observe_ccd
+from .ccd_observation import CollectedStars, Observation, collected_images, observe_ccds
 from .photometry import effective_fwhm, signal_to_noise
 from .sky_axes import sky_jacobians
 from .star_field import StarField
@@ -64,15 +65,36 @@ class CcdFit(NamedTuple):
         )
 
 
-class _ObservedCcd(NamedTuple):
-    """Stars of one CCD before they are modelled."""
+class _ExposedCcd(NamedTuple):
+    """Stars of one CCD before they are observed."""
 
     exposure: CcdExposure
     stars: StarField  #: with magnitudes of the limit that vignetting leaves
-    electrons: np.ndarray
     snr: np.ndarray
+    collected: CollectedStars
+
+
+class _ModelledCcd(NamedTuple):
+    """Model of one CCD with its images of the stars."""
+
+    exposed: _ExposedCcd
     observation: Observation
-    model_stars: CcdStars  #: those that the model is fitted to
+    model: PsfModel
+    colours: np.ndarray | None  #: of the stars
+    holdout_models: np.ndarray
+    star_models: np.ndarray
+
+
+class _ComparedCcd(NamedTuple):
+    """Model of one CCD with adaptive moments of stars and of models."""
+
+    modelled: _ModelledCcd
+    holdout: tuple[AdaptiveMoments, AdaptiveMoments]  #: of noise-free PSFs, and of the model there
+    observed: tuple[AdaptiveMoments, AdaptiveMoments]  #: of stars, and of the model there
+
+
+_Ccd = TypeVar("_Ccd")
+_Result = TypeVar("_Result")
 
 
 def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = True) -> CcdProduct:
@@ -93,47 +115,51 @@ def model_ccds(
 
     No CCD changes a byte of another: together they cost less, as covariances are searched and rays traced at once.
     """
-    modelled = _modelled(experiment, exposures, noisy=noisy)
-    jacobians = iter(_jacobians(experiment, [ccd[0] for ccd in modelled if not isinstance(ccd, PachonError)]))
-    products: list[CcdProduct | PachonError] = []
-    for ccd in modelled:
-        if isinstance(ccd, PachonError):
-            products.append(ccd)
-            continue
-        sky_axes = next(jacobians)
-        products.append(
-            sky_axes if isinstance(sky_axes, PachonError) else attempt(_product, experiment, *ccd, sky_axes)
-        )
-    return products
+
+    def produce(ccds: list[_ComparedCcd]) -> list[CcdProduct | PachonError]:
+        jacobians = _jacobians(experiment, ccds)
+        return [
+            axes if isinstance(axes, PachonError) else attempt(_product, experiment, ccd, axes)
+            for ccd, axes in zip(ccds, jacobians, strict=True)
+        ]
+
+    return _together(produce, _compared(experiment, exposures, noisy=noisy, every_star=True))
 
 
 def fit_ccds(experiment: Experiment, exposures: Sequence[CcdExposure]) -> list[CcdFit | PachonError]:
     """Return how the models of :func:`model_ccds` fit, to the same digits, without what only products have."""
     return [
-        ccd if isinstance(ccd, PachonError) else attempt(_fit, experiment, *ccd)
-        for ccd in _modelled(experiment, exposures, noisy=True)
+        ccd if isinstance(ccd, PachonError) else _fit(ccd)
+        for ccd in _compared(experiment, exposures, noisy=True, every_star=False)
     ]
 
 
-def _modelled(
-    experiment: Experiment, exposures: Sequence[CcdExposure], *, noisy: bool
-) -> list[tuple[_ObservedCcd, PsfModel] | PachonError]:
-    """Return the stars of CCDs and their model, with the error of a CCD in its place."""
-    ccds = [attempt(_observed, experiment, exposure, noisy=noisy) for exposure in exposures]
-    stars = [ccd.model_stars for ccd in ccds if not isinstance(ccd, PachonError)]
-    models = iter(fit_ccd_models(experiment, stars, noisy=noisy))
-    modelled: list[tuple[_ObservedCcd, PsfModel] | PachonError] = []
-    for ccd in ccds:
-        if isinstance(ccd, PachonError):
-            modelled.append(ccd)
-            continue
-        model = next(models)
-        modelled.append(model if isinstance(model, PachonError) else (ccd, model))
-    return modelled
+def _together(
+    function: Callable[[list[_Ccd]], Sequence[_Result | PachonError]], ccds: Sequence[_Ccd | PachonError]
+) -> list[_Result | PachonError]:
+    """Return what a function of all CCDs without an error gives for each of them, with the error of a CCD in its place.
+
+    No CCD may change a byte of another.
+    """
+    good = [ccd for ccd in ccds if not isinstance(ccd, PachonError)]
+    results = iter(function(good) if good else ())
+    return [ccd if isinstance(ccd, PachonError) else next(results) for ccd in ccds]
 
 
-def _observed(experiment: Experiment, exposure: CcdExposure, *, noisy: bool) -> _ObservedCcd:
-    """Add noise and defects to the stars of one CCD where `noisy`; DomainError if too few are left for a model."""
+def _compared(
+    experiment: Experiment, exposures: Sequence[CcdExposure], *, noisy: bool, every_star: bool
+) -> list[_ComparedCcd | PachonError]:
+    """Model the stars of CCDs, with noise and defects where `noisy`, and measure stars and models.
+
+    Noise-free stars are those at the holdout positions, others those of the model or `every_star`.
+    """
+    exposed = [attempt(_exposed, experiment, exposure) for exposure in exposures]
+    modelled = _together(partial(_modelled, experiment, noisy=noisy), exposed)
+    return _together(partial(_measured, experiment, every_star=every_star), modelled)
+
+
+def _exposed(experiment: Experiment, exposure: CcdExposure) -> _ExposedCcd:
+    """Return the stars of one CCD with their light."""
     holdout, observed = exposure.holdout, exposure.observed
     # Positions do not depend on the magnitude limits, which follow from the vignetting of the stars.
     width = effective_fwhm(holdout.image, holdout.pixel_scale)
@@ -141,30 +167,69 @@ def _observed(experiment: Experiment, exposure: CcdExposure, *, noisy: bool) -> 
     electrons = stars.electrons * observed.lit_fraction
     dimmed = stars.magnitude - 2.5 * np.log10(observed.lit_fraction)
     snr = signal_to_noise(dimmed, stars.band, experiment.config.atmosphere.exposure_s, width)
-    collected = collected_images(experiment, observed.image, observed.pixel_scale, electrons)
-    observation = observe_ccd(experiment, exposure.name, collected, observed.pixel_scale, electrons, noisy=noisy)
-    return _ObservedCcd(exposure, stars, electrons, snr, observation, model_stars(experiment, observation, stars, snr))
+    images = collected_images(experiment, observed.image, observed.pixel_scale, electrons)
+    return _ExposedCcd(exposure, stars, snr, CollectedStars(exposure.name, images, observed.pixel_scale, electrons))
 
 
-def _jacobians(experiment: Experiment, ccds: Sequence[_ObservedCcd]) -> list[list[np.ndarray] | PachonError | None]:
+def _modelled(experiment: Experiment, ccds: Sequence[_ExposedCcd], *, noisy: bool) -> list[_ModelledCcd | PachonError]:
+    """Observe the stars of CCDs and model their PSF; DomainError for one with too few stars."""
+    observations = observe_ccds(experiment, [ccd.collected for ccd in ccds], noisy=noisy)
+
+    def stars_of(ccd: _ExposedCcd, observation: Observation | PachonError) -> tuple[_ExposedCcd, Observation, CcdStars]:
+        if isinstance(observation, PachonError):
+            raise observation
+        return ccd, observation, model_stars(experiment, observation, ccd.stars, ccd.snr)
+
+    def fit(ccds: Sequence[tuple[_ExposedCcd, Observation, CcdStars]]) -> list[_ModelledCcd | PachonError]:
+        models = fit_ccd_models(experiment, [stars for _, _, stars in ccds], noisy=noisy)
+        return [
+            model if isinstance(model, PachonError) else attempt(_model_images, experiment, exposed, observation, model)
+            for (exposed, observation, _), model in zip(ccds, models, strict=True)
+        ]
+
+    return _together(fit, [attempt(stars_of, *pair) for pair in zip(ccds, observations, strict=True)])
+
+
+def _model_images(
+    experiment: Experiment, exposed: _ExposedCcd, observation: Observation, model: PsfModel
+) -> _ModelledCcd:
+    """Evaluate the model of one CCD at the holdout positions and at the stars."""
+    # Noise-free PSFs are those of flat spectra.
+    colours, flat = star_colours(experiment, exposed.stars), float(experiment.wavelengths.mean())
+    holdout = exposed.exposure.positions.holdout
+    positions = np.concatenate([holdout, exposed.stars.observed])
+    of_stars = np.full(len(exposed.stars.observed), flat) if colours is None else colours
+    images = model.at(positions, colour=np.concatenate([np.full(len(holdout), flat), of_stars]))
+    return _ModelledCcd(exposed, observation, model, colours, *np.split(images, [len(holdout)]))
+
+
+def _measured(experiment: Experiment, ccds: Sequence[_ModelledCcd], *, every_star: bool) -> list[_ComparedCcd]:
+    """Measure stars and models of CCDs."""
+    stamps = []
+    for ccd in ccds:
+        observation = ccd.observation
+        rows = slice(None) if every_star else observation.used
+        # Like e, g is not that of a star with a defect.
+        clean_stars = np.where((observation.defects == 0)[rows, None, None], observation.images[rows], np.nan)
+        holdout_images = ccd.exposed.exposure.holdout.image.astype(np.float64)
+        stamps += [holdout_images, ccd.holdout_models, clean_stars, ccd.star_models[rows]]
+    moments = _adaptive_of(experiment, stamps, ccds[0].exposed.exposure.holdout.pixel_scale)
+    return [
+        _ComparedCcd(ccd, (moments[i], moments[i + 1]), (moments[i + 2], moments[i + 3]))
+        for i, ccd in zip(range(0, len(moments), 4), ccds, strict=True)
+    ]
+
+
+def _jacobians(experiment: Experiment, ccds: Sequence[_ComparedCcd]) -> list[list[np.ndarray] | PachonError | None]:
     """Return d(sky)/d(x, y) at the holdout positions and stars of each CCD, or its error; None without a pointing."""
     if experiment.pointing is None:
         return [None] * len(ccds)
-    groups = [[ccd.exposure.positions.holdout, ccd.stars.observed] for ccd in ccds]
+    exposed = [ccd.modelled.exposed for ccd in ccds]
+    groups = [[ccd.exposure.positions.holdout, ccd.stars.observed] for ccd in exposed]
     together = attempt(sky_jacobians, experiment, [positions for group in groups for positions in group])
     if isinstance(together, PachonError):  # of one CCD
         return [attempt(sky_jacobians, experiment, group) for group in groups]
     return [together[i : i + 2] for i in range(0, len(together), 2)]
-
-
-class _Compared(NamedTuple):
-    """Images of the model of one CCD, and adaptive moments of stars and models."""
-
-    colours: np.ndarray | None  #: of the stars
-    holdout_models: np.ndarray
-    star_models: np.ndarray
-    holdout: tuple[AdaptiveMoments, AdaptiveMoments]
-    observed: tuple[AdaptiveMoments, AdaptiveMoments]
 
 
 def _adaptive_of(experiment: Experiment, stamps: Sequence[np.ndarray], pixel_scale: float) -> list[AdaptiveMoments]:
@@ -172,40 +237,22 @@ def _adaptive_of(experiment: Experiment, stamps: Sequence[np.ndarray], pixel_sca
     # From near the width of stars the iteration takes half the steps. Other CCDs are exposed meanwhile.
     start = experiment.weight_fwhm / FWHM_PER_RMS
     together = adaptive_moments(np.concatenate(stamps), pixel_scale, start_sigma=start, threads=1)
-    ends = np.cumsum([len(group) for group in stamps[:-1]])
-    columns = [np.split(getattr(together, field.name), ends) for field in dataclasses.fields(AdaptiveMoments)]
-    return [AdaptiveMoments(*group) for group in zip(*columns, strict=True)]
+    return [rows_of(together, rows) for rows in slices_of(stamps)]
 
 
-def _compared(experiment: Experiment, ccd: _ObservedCcd, model: PsfModel, rows: np.ndarray | slice) -> _Compared:
-    """Compare the model of one CCD with noise-free PSFs at the holdout positions, and with the stars of some rows."""
-    holdout, stars, observation = ccd.exposure.holdout, ccd.stars, ccd.observation
-    # Noise-free PSFs are those of flat spectra.
-    colours, flat = star_colours(experiment, stars), float(experiment.wavelengths.mean())
-    holdout_models = model.at(ccd.exposure.positions.holdout, colour=flat)
-    star_models = model.at(stars.observed, colour=colours)
-    # Like e, g is not that of a star with a defect.
-    clean_stars = np.where((observation.defects == 0)[rows, None, None], observation.images[rows], np.nan)
-
-    stamps = [holdout.image.astype(np.float64), holdout_models, clean_stars, star_models[rows]]
-    measured = _adaptive_of(experiment, stamps, holdout.pixel_scale)
-    return _Compared(colours, holdout_models, star_models, (measured[0], measured[1]), (measured[2], measured[3]))
-
-
-def _fit(experiment: Experiment, ccd: _ObservedCcd, model: PsfModel) -> CcdFit:
+def _fit(ccd: _ComparedCcd) -> CcdFit:
     """Return how the model of one CCD fits."""
-    compared = _compared(experiment, ccd, model, ccd.observation.used)
-    holdout, observed = ModelledMoments.of(*compared.holdout), ModelledMoments.of(*compared.observed)
-    return CcdFit(ccd.exposure.name, ccd.exposure.holdout.pixel_scale, holdout, observed)
+    exposure = ccd.modelled.exposed.exposure
+    holdout, observed = ModelledMoments.of(*ccd.holdout), ModelledMoments.of(*ccd.observed)
+    return CcdFit(exposure.name, exposure.holdout.pixel_scale, holdout, observed)
 
 
-def _product(
-    experiment: Experiment, ccd: _ObservedCcd, model: PsfModel, jacobians: Sequence[np.ndarray] | None
-) -> CcdProduct:
+def _product(experiment: Experiment, compared: _ComparedCcd, jacobians: Sequence[np.ndarray] | None) -> CcdProduct:
     """Compare the model of one CCD with its stars, and with the noise-free PSFs between them."""
-    config, stars, observation = experiment.config, ccd.stars, ccd.observation
-    name, positions = ccd.exposure.name, ccd.exposure.positions
-    holdout, observed = ccd.exposure.holdout, ccd.exposure.observed
+    config, modelled = experiment.config, compared.modelled
+    exposure, stars, snr, collected = modelled.exposed
+    observation, model = modelled.observation, modelled.model
+    name, positions, holdout, observed = exposure.name, exposure.positions, exposure.holdout, exposure.observed
     used = observation.used
     holdout_images = holdout.image.astype(np.float64)
     holdout_shapes = measure_shapes(holdout_images, holdout.pixel_scale, experiment.weight_fwhm)
@@ -222,7 +269,6 @@ def _product(
     def shapes_of(images: np.ndarray) -> Shapes:
         return measure_shapes(images, observed.pixel_scale, experiment.weight_fwhm)
 
-    compared = _compared(experiment, ccd, model, slice(None))
     left_out_models = model.leave_one_out()
     left_out_moments = _adaptive_of(experiment, [left_out_models], observed.pixel_scale)[0]
     x, y = experiment.camera.centers[experiment.camera.ccd_index(name)]
@@ -234,23 +280,23 @@ def _product(
         noise=observation.noise,
         holdout=HoldoutStars(
             **_position_columns(experiment, positions.holdout, holdout.fields),
-            **_shape_columns(holdout_shapes, shapes_of(compared.holdout_models)),
+            **_shape_columns(holdout_shapes, shapes_of(modelled.holdout_models)),
             **_adaptive_columns(*compared.holdout),
             **_sky_columns(holdout_axes, holdout_shapes, compared.holdout[0]),
             fwhm=fwhm(holdout.image, holdout.pixel_scale),
         ),
         observed=ObservedStars(
             **_position_columns(experiment, stars.observed, observed.fields),
-            **_shape_columns(observation.shapes, shapes_of(compared.star_models)),
+            **_shape_columns(observation.shapes, shapes_of(modelled.star_models)),
             **_adaptive_columns(*compared.observed),
             **_sky_columns(star_axes, observation.shapes, compared.observed[0]),
             **_leave_one_out_columns(used, shapes_of(left_out_models), left_out_moments),
             magnitude=stars.magnitude,
-            electrons=ccd.electrons,
-            snr=ccd.snr,
+            electrons=collected.electrons,
+            snr=snr,
             defects=observation.defects,
             used=used,
-            colour=compared.colours,
+            colour=modelled.colours,
         ),
         holdout_images=holdout_images.astype(np.float32),
         observed_images=observation.images.astype(np.float32),
