@@ -8,7 +8,7 @@ from ...core.launch import FORWARD_OPTIONS
 from .clear_pupil import MOST_RINGS
 from .packet_functions import squared_baseline, tabulated_packet, unit_circle
 from .sample_packets import LANES, samples
-from .spoke_sums import add_inner_points, add_rims
+from .spoke_sums import add_inner_points, add_rims, lay_waves
 
 wp.set_module_options(FORWARD_OPTIONS)
 
@@ -228,6 +228,7 @@ def transform_pupils(
     outer_start = n_point - n_spoke
     # One over the part of a spoke's light in its outermost points, of Lobatto's rule.
     n_ring = n_point // n_spoke
+    n_sample = n_depth * n_point
     whole_spoke = wp.float32(n_ring * (n_ring - 1))
     for packet in range(n_packet):
         for row in range(rows[packet]):
@@ -243,17 +244,8 @@ def transform_pupils(
                 if point < inner_end or point >= outer_start:
                     scale = wp.float32(1.0)
                 sample = depth * n_point + point
-                for packet in range(n_packet):
-                    number = lane_numbers(packet)
-                    cosine, sine = unit_circle(-x * number)
-                    fade = scale * fade_x[light_channel, packet]
-                    along_x[star, packet, sample, 0] = wp.cw_mul(fade, cosine)
-                    along_x[star, packet, sample, 1] = wp.cw_mul(fade, sine)
-                for packet in range(n_packet):
-                    number = lane_numbers(packet)
-                    cosine, sine = unit_circle(-y * number)
-                    along_y[star, packet, sample, 0] = wp.cw_mul(fade_y[light_channel, packet], cosine)
-                    along_y[star, packet, sample, 1] = wp.cw_mul(fade_y[light_channel, packet], sine)
+                lay_waves(x, scale, fade_x[light_channel], sample, n_sample, n_packet, along_x[star])
+                lay_waves(y, wp.float32(1.0), fade_y[light_channel], sample, n_sample, n_packet, along_y[star])
         for rim in range(2 * n_spoke):
             point = rim
             if rim >= n_spoke:

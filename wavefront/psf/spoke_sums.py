@@ -1,7 +1,8 @@
 """Sums of waves over the points of a pupil on spokes, for a packet of frequencies.
 
 They are written in C with vectors of the compiler, which stay in the processor's registers: loops that Warp writes keep
-an index, and its checks, beside every operation. Each operation is a statement, so that none is contracted.
+an index, and its checks, beside every operation. A product and a sum in one expression are one operation of the
+processor, where it has that.
 """
 
 from __future__ import annotations
@@ -19,29 +20,60 @@ RIM_NUMBERS = 5
 # Lanes of rims whose sums, which are more than those of other points, stay in registers together.
 _RIM_LANES = LANES // 2
 
-# Products of cosines and sines along x (a, b) and y (c, d) of a point.
-_PRODUCTS = f"""
+# Taylor series over an eighth of a turn to either side of the nearest quarter, as in :func:`.unit_circle`.
+_WAVES_ALONG = f"""
+    typedef float packet __attribute__((vector_size({4 * LANES}), aligned(4)));
+    typedef int integers __attribute__((vector_size({4 * LANES}), aligned(4)));
+    const packet number = {{{", ".join(f"{i}.0f" for i in range(LANES))}}};
+    const packet quarters = -4.0f * turn * number;
+    const packet nearest = __builtin_elementwise_floor(quarters + 0.5f);
+    const packet angle = (quarters - nearest) * 1.57079632679f;
+    const packet s = angle * angle;
+    const packet near_sine = angle * (1.0f + s * (-1.0f / 6.0f + s * (1.0f / 120.0f + s * (-1.0f / 5040.0f
+        + s * (1.0f / 362880.0f)))));
+    const packet near_cosine = 1.0f + s * (-0.5f + s * (1.0f / 24.0f + s * (-1.0f / 720.0f + s * (1.0f / 40320.0f))));
+    const integers quadrant = __builtin_convertvector(nearest, integers) & 3;
+    const integers odd = (quadrant & 1) == 1;
+    const packet c = odd ? near_sine : near_cosine;
+    const packet d = odd ? near_cosine : near_sine;
+    packet cosine = ((quadrant + 1) & 2) ? -c : c;
+    packet sine = (quadrant & 2) ? -d : d;
+    // Each packet is the one before, turned by as many numbers as it has.
+    const float turned_cosine = cosine[{LANES - 1}] * cosine[1] - sine[{LANES - 1}] * sine[1];
+    const float turned_sine = sine[{LANES - 1}] * cosine[1] + cosine[{LANES - 1}] * sine[1];
+    float* out = (float*)along.data + 2 * {LANES} * sample;
+    const float* filter = (const float*)fade.data;
+    for (int k = 0; k < n_packet; ++k) {{
+        const packet scales = scale * *(const packet*)filter;
+        *(packet*)out = scales * cosine;
+        *(packet*)(out + {LANES}) = scales * sine;
+        const packet next = turned_cosine * cosine - turned_sine * sine;
+        sine = turned_cosine * sine + turned_sine * cosine;
+        cosine = next;
+        filter += {LANES};
+        out += 2 * {LANES} * n_sample;
+    }}
+"""
+# Cosine and sine along x (a, b) and y (c, d) of a point.
+_WAVES = f"""
                 const packet a = *(const packet*)(x + 2 * {LANES} * point);
                 const packet b = *(const packet*)(x + 2 * {LANES} * point + {LANES});
                 const float c = y[2 * {LANES} * point];
                 const float d = y[2 * {LANES} * point + {LANES}];
-                const packet ca = c * a;
-                const packet db = d * b;
-                const packet da = d * a;
-                const packet cb = c * b;
 """
 _INNER_LOOP = f"""
+    #pragma clang fp contract(fast)
     typedef float packet __attribute__((vector_size({4 * LANES}), aligned(4)));
     const float* x = (const float*)along_x.data;
     const float* y = (const float*)along_y.data + row % {LANES};
     packet cc = {{}}, ss = {{}}, cs = {{}}, sc = {{}};
     for (int depth = 0; depth < n_depth; ++depth)
         for (int point = depth * n_point + n_spoke; point < (depth + 1) * n_point - n_spoke; ++point) {{
-            {_PRODUCTS}
-            cc = cc + ca;
-            ss = ss + db;
-            cs = cs + da;
-            sc = sc + cb;
+            {_WAVES}
+            cc = cc + c * a;
+            ss = ss + d * b;
+            cs = cs + d * a;
+            sc = sc + c * b;
         }}
     // At -row the sine along y has the other sign.
     packet* sum = (packet*)sums.data;
@@ -51,6 +83,7 @@ _INNER_LOOP = f"""
     sum[3] = sc - cs;
 """
 _RIM_LOOP = f"""
+    #pragma clang fp contract(fast)
     typedef float packet __attribute__((vector_size({4 * _RIM_LANES}), aligned(4)));
     const float* numbers = rims.data;
     float* sum = (float*)sums.data;
@@ -62,67 +95,59 @@ _RIM_LOOP = f"""
         packet column;
         for (int i = 0; i < {_RIM_LANES}; ++i)
             column[i] = (float)(first_column + from + i);
+        const float* own = numbers;
         packet re_plus = *(packet*)(sum + from);
         packet im_plus = *(packet*)(sum + {LANES} + from);
         packet re_minus = *(packet*)(sum + {2 * LANES} + from);
         packet im_minus = *(packet*)(sum + {3 * LANES} + from);
         for (int rim = 0; rim < 2 * n_spoke; ++rim) {{
-            int point = rim < n_spoke ? rim : rim + n_point - 2 * n_spoke;
-            packet cc, ss, cs, sc;
-            for (int depth = 0; depth < n_depth; ++depth) {{
-                {_PRODUCTS}
-                cc = depth ? cc + ca : ca;
-                ss = depth ? ss + db : db;
-                cs = depth ? cs + da : da;
-                sc = depth ? sc + cb : cb;
-                point += n_point;
+            if (rim == n_spoke) {{
+                x += 2 * {LANES} * (n_point - 2 * n_spoke);
+                y += 2 * {LANES} * (n_point - 2 * n_spoke);
             }}
-            const float* own = numbers + {RIM_NUMBERS} * rim;
+            packet cc = y[0] * *(const packet*)x;
+            packet ss = y[{LANES}] * *(const packet*)(x + {LANES});
+            packet cs = y[{LANES}] * *(const packet*)x;
+            packet sc = y[0] * *(const packet*)(x + {LANES});
+            #pragma clang loop unroll(disable)
+            for (int depth = 1; depth < n_depth; ++depth) {{
+                const int point = depth * n_point;
+                {_WAVES}
+                cc = cc + c * a;
+                ss = ss + d * b;
+                cs = cs + d * a;
+                sc = sc + c * b;
+            }}
+            x += 2 * {LANES};
+            y += 2 * {LANES};
             const float across_y = own[1] * (float)row;
             const float lean_y = own[3] * (float)row;
             const float light = own[4];
-            const packet across_x = own[0] * column;
-            const packet lean_x = own[2] * column;
-            packet plus = __builtin_elementwise_abs(across_x + across_y);
-            packet minus = __builtin_elementwise_abs(across_x - across_y);
+            packet plus = __builtin_elementwise_abs(own[0] * column + across_y);
+            packet minus = __builtin_elementwise_abs(own[0] * column - across_y);
             if (meeting.data[rim]) {{
                 const float* opposite = numbers + {RIM_NUMBERS} * ((rim + n_spoke) % (2 * n_spoke));
                 const float opposite_y = opposite[1] * (float)row;
                 const float whole = light * whole_spoke;
-                const packet opposite_x = opposite[0] * column;
-                const packet both_plus = plus + __builtin_elementwise_abs(opposite_x + opposite_y);
-                const packet both_minus = minus + __builtin_elementwise_abs(opposite_x - opposite_y);
-                const packet part_plus = whole / __builtin_elementwise_max(both_plus, tiny);
-                const packet part_minus = whole / __builtin_elementwise_max(both_minus, tiny);
-                plus = plus * __builtin_elementwise_min(one, part_plus);
-                minus = minus * __builtin_elementwise_min(one, part_minus);
+                const packet both_plus = plus + __builtin_elementwise_abs(opposite[0] * column + opposite_y);
+                const packet both_minus = minus + __builtin_elementwise_abs(opposite[0] * column - opposite_y);
+                plus = plus * __builtin_elementwise_min(one, whole / __builtin_elementwise_max(both_plus, tiny));
+                minus = minus * __builtin_elementwise_min(one, whole / __builtin_elementwise_max(both_minus, tiny));
             }}
-            const packet square_plus = plus * plus;
-            const packet square_minus = minus * minus;
-            const packet phase_plus = square_plus * (lean_x + lean_y);
-            const packet phase_minus = square_minus * (lean_x - lean_y);
+            const packet phase_plus = plus * plus * (own[2] * column + lean_y);
+            const packet phase_minus = minus * minus * (own[2] * column - lean_y);
             const packet left_plus = light - plus;
             const packet left_minus = light - minus;
             const packet real_plus = cc - ss;
             const packet imaginary_plus = cs + sc;
             const packet real_minus = cc + ss;
             const packet imaginary_minus = sc - cs;
-            packet part = left_plus * real_plus;
-            re_plus = re_plus + part;
-            part = phase_plus * imaginary_plus;
-            re_plus = re_plus + part;
-            part = left_plus * imaginary_plus;
-            im_plus = im_plus + part;
-            part = phase_plus * real_plus;
-            im_plus = im_plus - part;
-            part = left_minus * real_minus;
-            re_minus = re_minus + part;
-            part = phase_minus * imaginary_minus;
-            re_minus = re_minus + part;
-            part = left_minus * imaginary_minus;
-            im_minus = im_minus + part;
-            part = phase_minus * real_minus;
-            im_minus = im_minus - part;
+            // In brackets: the next rim waits for one sum only.
+            re_plus = re_plus + (left_plus * real_plus + phase_plus * imaginary_plus);
+            im_plus = im_plus + (left_plus * imaginary_plus - phase_plus * real_plus);
+            re_minus = re_minus + (left_minus * real_minus + phase_minus * imaginary_minus);
+            im_minus = im_minus + (left_minus * imaginary_minus - phase_minus * real_minus);
+            own += {RIM_NUMBERS};
         }}
         *(packet*)(sum + from) = re_plus;
         *(packet*)(sum + {LANES} + from) = im_plus;
@@ -130,6 +155,23 @@ _RIM_LOOP = f"""
         *(packet*)(sum + {3 * LANES} + from) = im_minus;
     }}
 """
+
+
+@wp.func_native(_WAVES_ALONG)
+def lay_waves(
+    turn: wp.float32,
+    scale: wp.float32,
+    fade: wp.array(dtype=samples),
+    sample: wp.int32,
+    n_sample: wp.int32,
+    n_packet: wp.int32,
+    along: wp.array3d(dtype=samples),
+):
+    """Lay the wave of one point along an axis: cosines and sines of minus its frequencies times a turn, to 1e-7.
+
+    Arguments: scale and fade [packet], filters of the frequencies; along [packet, n_sample, 2]: results at a sample.
+    """
+    ...
 
 
 @wp.func_native(_INNER_LOOP)
