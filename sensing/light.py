@@ -172,8 +172,8 @@ class Instrument:
         diameter = 2.0 * float(np.hypot(*place.T).max()) * (1.0 + 1.0 / _SURVEY)
         diffracting = None
         if self.model.diffraction:
-            pieces = math.ceil(_PIECES_A_PIXEL * diameter / self.pixel)
-            diffracting = pupil_rims(telescope, direction, self.middle, min(max(pieces, _FEWEST_PIECES), PIECES))
+            pieces = diffracting_pieces(diameter / self.pixel)
+            diffracting = pupil_rims(telescope, direction, self.middle, pieces)
         rims = movable_rims(telescope, points, ends)
         light = StarLight(telescope, direction, diameter, depth, jacobian, rims, diffracting)
         if not self.model.rims.size:
@@ -262,6 +262,11 @@ class Instrument:
             pixels, self.pixel, self.seeing, light.jacobian, blur, rays.footprint, sharp, reach, light.pupil_rims
         )
         return Stamp(pixels.image, pixels.variance, pixels.used, grid, rays)
+
+
+def diffracting_pieces(pixels: float) -> int:
+    """Return into how many pieces the diffracting rims of a donut of so many pixels across are divided."""
+    return min(max(math.ceil(_PIECES_A_PIXEL * pixels), _FEWEST_PIECES), PIECES)
 
 
 def _survey(telescope: Telescope, across: int) -> np.ndarray:

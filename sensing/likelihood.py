@@ -54,7 +54,7 @@ class Stamp:
 
     def forget(self) -> None:
         """Free the derivatives of the last linear model."""
-        self.grid.last = None
+        self.grid.last = self.grid.point = None
 
     def release(self) -> None:
         """Free what the model can compute again."""
@@ -148,6 +148,21 @@ class _Derivatives:
         )
 
 
+@dataclass(frozen=True)
+class _Point:
+    """The last linear model of a stamp, and its unknowns: checks of a solution follow each other."""
+
+    stamp: Stamp
+    unknowns: np.ndarray
+    wave: np.ndarray
+    linearized: Linearized
+
+    def is_of(self, stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> bool:
+        """Return whether it is that of a stamp at unknowns."""
+        same = np.array_equal(self.unknowns, unknowns) and np.array_equal(self.wave, wave)
+        return self.stamp is stamp and same
+
+
 def _derivatives(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> tuple[np.ndarray, ...] | None:
     """Return image, derivatives and scales; None where light has no direction or misses the telescope."""
     last, landing = stamp.grid.last, stamp.rays.landing(wave)
@@ -167,6 +182,9 @@ def _derivatives(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> tuple[
 
 def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Linearized | None:
     """Return the linear model of a stamp about unknowns; None where light has no direction or misses the telescope."""
+    last = stamp.grid.point
+    if isinstance(last, _Point) and last.is_of(stamp, unknowns, wave):
+        return last.linearized
     derivatives = _derivatives(stamp, unknowns, wave)
     if derivatives is None:
         return None
@@ -178,7 +196,9 @@ def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Lineariz
     root = (1.0 / np.sqrt(variance[used].ravel())).astype(np.float32)
     scaled = columns[used].reshape(len(root), -1) * root[:, None]
     brightness = unknowns[FLUX] * columns[..., FLUX].astype(np.float64)
-    return Linearized(model, variance, brightness, stamp.used, residual, residual * root, scaled, scales)
+    point = Linearized(model, variance, brightness, stamp.used, residual, residual * root, scaled, scales)
+    stamp.grid.point = _Point(stamp, unknowns.copy(), wave.copy(), point)
+    return point
 
 
 def light_columns(

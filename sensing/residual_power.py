@@ -52,7 +52,7 @@ _FAINTEST = 1e-6
 #: Fields whose power in the residuals decides whether there is any beyond that of noise.
 _SCREENED = ("white", "noise_0.8", "brightness", "rims")
 #: Largest number of pixels; beyond, squares of them are summed.
-_MOST_PIXELS = 17_000
+_MOST_PIXELS = 5_000
 #: Ridge of the normal equations of the strengths, over their diagonal: fields that differ little share the power.
 _RIDGE = 1e-6
 #: Pixels whose changes by all unknowns are multiplied at once.
