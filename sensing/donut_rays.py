@@ -85,7 +85,7 @@ class ZernikeRays:
         cells: PupilCells,
         noll: np.ndarray,
     ) -> None:
-        self._direction, self._wavelengths = direction, wavelengths
+        self._direction, self._wavelengths, self._fractions = direction, wavelengths, wavelength_weights
         self.cells, self._points = cells, cells.points
         self._weights, self.rates = cells.at_wavelengths(wavelength_weights)
         self._middle = float(wavelengths[len(wavelengths) // 2])
@@ -100,12 +100,16 @@ class ZernikeRays:
         """Have the landing points of light through a telescope."""
         self._telescope = telescope
         self._chief = chief_landing(telescope, self._direction, self._middle)
+        self._begin({})
+
+    def _begin(self, straight: dict[float, np.ndarray]) -> None:
+        """Begin with landing points without a wavefront beside the telescope's, where they are at hand."""
         #: Coefficients and landing points of the last light, with those that it follows, and of the last light that was
         #: traced; landing points and spread of the last light of which it was computed.
         self._last: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         self._traced: tuple[np.ndarray, np.ndarray] | None = None
         self._spread: tuple[np.ndarray, np.ndarray] | None = None
-        self._straight: dict[float, np.ndarray] = {}
+        self._straight, self._merged = straight, None
         #: Sides of the image of a cell [m], columns of a matrix.
         self.footprint = self.cells.footprint(self._unaberrated(self._middle))
 
@@ -114,6 +118,27 @@ class ZernikeRays:
         rays = copy(self)
         rays._set_telescope(telescope)
         return rays
+
+    def merged(self) -> ZernikeRays:
+        """Return the light of squares of two by two cells, for images that are coarse enough."""
+        if self._merged is None:
+            merging = self.cells.merging()
+
+            def mean(values: np.ndarray) -> np.ndarray:
+                """Return means of values of the cells [..., n]."""
+                return np.asarray((merging @ values.reshape(-1, values.shape[-1]).T).T.reshape(*values.shape[:-1], -1))
+
+            rays = copy(self)
+            rays.cells = self.cells.merged(merging)
+            rays._points = rays.cells.points
+            rays._weights, rays.rates = rays.cells.at_wavelengths(self._fractions)
+            rays._gradients = mean(self._gradients)
+            rays._jacobians = [np.moveaxis(mean(np.moveaxis(j, 1, 2)), 2, 1) for j in self._jacobians]
+            rays._begin({w: mean(landing.T).T for w, landing in self._straight.items()})
+            rays._set_response(rays._gradients)
+            rays._moving = rays._single
+            self._merged = rays
+        return self._merged
 
     def _landing(self, wavelength: float, slopes: np.ndarray) -> np.ndarray:
         """Return detector x and y [m] of rays, [m, n, 2], with direction cosines changed by slopes [m, n or 1, 2]."""

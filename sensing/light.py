@@ -225,6 +225,11 @@ class Instrument:
         across = self.model.n_pupil or min(max(math.ceil(finer * light.diameter / spacing), _FEWEST), _MOST)
         return Sampling(sharp, across)
 
+    def may_merge(self, light: StarLight, pixels: Pixels, rays: ZernikeRays) -> bool:
+        """Return whether smoothed pixels blur images so much that larger cells of the pupil are fine enough."""
+        cell = math.sqrt(abs(float(np.linalg.det(rays.footprint))))
+        return pixels.blur > 0.0 and 2.0 * cell < _SPACING * self._width(light, pixels, 0.0)
+
     def binning(self, light: StarLight, pixels: Pixels, fwhm: float) -> int:
         """Return how many pixels along each axis are summed for the fit of a star in a seeing [rad].
 

@@ -8,7 +8,7 @@ constant, :math:`\sum (d + s) \ln(m + s) - (m + s)` with data d, model m and sky
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -230,6 +230,21 @@ def light_columns(
     root = (1.0 / np.sqrt(point.variance[point.used])).astype(np.float32)
     gained = columns[point.used][:, columns.shape[-1] - count :] * root[:, None]
     return gained - np.outer(point.columns[:, FLUX], rates.sum(axis=0).astype(np.float32)), scales[-count:]
+
+
+def wavefront_columns(
+    stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray, point: Linearized, rays: LightRays
+) -> np.ndarray:
+    """Return derivatives by the unknowns that rays respond to, over the noise [per unknown], shape [n_pixel, n_wave].
+
+    They are those at the unknowns of a stamp, with the noise of its linear model there.
+    """
+    landing, response = rays.landing(wave), rays.response(wave)
+    light = _landed(replace(stamp, rays=rays), wave, landing, response)
+    columns, scales = stamp.grid.derivatives(unknowns, light, response, rays.rates[:, :0])[1:]
+    root = (1.0 / np.sqrt(point.variance[point.used])).astype(np.float32)
+    first = len(unknowns)
+    return columns[point.used][:, first:] * (root[:, None] * scales[first:].astype(np.float32))
 
 
 def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> NormalEquations:

@@ -25,12 +25,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
 from scipy.linalg import cho_factor, eigh, solve_triangular, toeplitz
-from scipy.optimize import minimize, nnls
+from scipy.optimize import nnls
 
 from .likelihood import Linearized
 
@@ -47,12 +47,15 @@ _NEEDED = 3.0
 _WORTH = 2.0
 #: Logarithms of the rms of a field of patterns between which the likeliest is searched, in units of itself.
 _RMS_LIMITS = (-5.0, 4.0)
+#: Values of each size that are tried at once, and times that this is done, each between the best one's neighbours.
+_STARTS = 9
+_ZOOMS = 5
 #: Variance of a combination of patterns over the largest one below which it says nothing.
 _FAINTEST = 1e-6
 #: Fields whose power in the residuals decides whether there is any beyond that of noise.
 _SCREENED = ("white", "noise_0.8", "brightness", "rims")
 #: Largest number of pixels; beyond, squares of them are summed.
-_MOST_PIXELS = 5_000
+_MOST_PIXELS = 17_000
 #: Ridge of the normal equations of the strengths, over their diagonal: fields that differ little share the power.
 _RIDGE = 1e-6
 #: Pixels whose changes by all unknowns are multiplied at once.
@@ -194,33 +197,44 @@ class _Patterns:
             return 0.0, 0.0
         variances, vectors = eigh(np.diag(self.variances), np.eye(count) + power)
         energies = (vectors.T @ self.amplitudes) ** 2
-
-        def loss(sizes: np.ndarray) -> tuple[float, np.ndarray]:
-            """Return the loss at logarithms of the rms of the field and of the variance of all, and its slopes."""
-            level, of_field = np.exp(sizes[1]), np.exp(2.0 * sizes[0]) * variances
-            total = level + of_field
-            slope = 0.5 * (1.0 - energies / total) / total
-            value = 0.5 * (np.log(total) + energies / total).sum()
-            return float(value), np.array([2.0 * slope @ of_field, slope.sum() * level])
-
+        # Amplitudes of the field from next to nothing to far beyond their own size, and the level of all up to the
+        # logarithm of their mean square, beyond it where the field lowers it.
         noise = math.log(max(float(energies.mean()), 1.0))
-        none, searched = (_RMS_LIMITS[0], _RMS_LIMITS[0]), _RMS_LIMITS
-        fits = [(loss(np.array([none[0], 0.0]))[0], 0.0, 0.0)]
-        for rms_limits, most in ((searched, 0.0), (none, noise), (searched, noise + 1.0)):
-            starts = [(min(0.0, rms_limits[1]), start) for start in ((0.0, noise) if most else (0.0,))]
-            bounds = [rms_limits, (0.0, most)]
-            searches = [minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
-            best = min(searches, key=lambda search: search.fun)
-            strength, level = float(np.exp(2.0 * best.x[0])), 0.0
+        fits = [(_loss_of_sizes(np.zeros(1), np.ones(1), energies, variances)[0], 0.0, 0.0)]
+        nothing = np.full(1, _RMS_LIMITS[0])
+        for rms_limits, most in ((_RMS_LIMITS, 0.0), (None, noise), (_RMS_LIMITS, noise + 1.0)):
+            rms = nothing if rms_limits is None else np.linspace(*rms_limits, _STARTS)
+            levels = np.linspace(0.0, most, _STARTS) if most else np.zeros(1)
+            for _ in range(_ZOOMS):
+                sizes = np.exp(2.0 * rms)[:, None], np.exp(levels)
+                losses = _loss_of_sizes(*(v.ravel() for v in np.broadcast_arrays(*sizes)), energies, variances)
+                row, column = np.unravel_index(int(np.argmin(losses)), (len(rms), len(levels)))
+                best = float(losses.min()), float(rms[row]), float(levels[column])
+                rms = _nearer(rms, row)
+                levels = _nearer(levels, column)
+            strength, level = math.exp(2.0 * best[1]), 0.0
             if most:
                 # What lies far out is part of it.
                 level = max(float((energies - strength * variances).mean()) - 1.0, 0.0)
-            worth = _WORTH * (int(rms_limits is searched) + int(most > 0.0))
-            fits.append((best.fun + worth, strength, level))
+            worth = _WORTH * (int(rms_limits is not None) + int(most > 0.0))
+            fits.append((best[0] + worth, strength, level))
         losses, strengths, levels = np.array(fits).T
         weights = np.exp(losses.min() - losses)
         weights /= weights.sum()
         return float(weights @ strengths), float(weights @ levels)
+
+
+def _loss_of_sizes(strength: np.ndarray, level: np.ndarray, energies: np.ndarray, variances: np.ndarray) -> np.ndarray:
+    """Return the loss of normal amplitudes of given energies [m] by strengths of the field and levels of all, [n]."""
+    total = level[:, None] + strength[:, None] * variances
+    return np.asarray(0.5 * (np.log(total) + energies / total).sum(axis=1))
+
+
+def _nearer(values: np.ndarray, best: int) -> np.ndarray:
+    """Return as many values between those beside the best of evenly spaced ones; a single one as it is."""
+    if len(values) == 1:
+        return values
+    return np.linspace(values[max(best - 1, 0)], values[min(best + 1, len(values) - 1)], len(values))
 
 
 class _Squares:
@@ -234,6 +248,13 @@ class _Squares:
         while used.size / self.side**2 > _MOST_PIXELS and min(used.shape) >= 4 * self.side:
             self.side *= 2
         self.used = np.asarray(self._cut(used[..., None])[..., 0].all(axis=(1, 3)))
+
+    def length(self, pixels: float) -> float:
+        """Return the correlation length [squares] of sums over squares of a field of a length in pixels.
+
+        The second moment of the correlation grows by twice that of a square about its pixels' centres.
+        """
+        return math.sqrt((pixels / self.side) ** 2 + (1.0 - self.side**-2) / 6.0)
 
     def _cut(self, images: np.ndarray) -> np.ndarray:
         """Return images [ny, nx, n] by squares, [ny, side, nx, side, n]."""
@@ -364,10 +385,13 @@ class StationaryField:
         return float((amplitude * (rows @ amplitude @ along)).sum())
 
 
+@lru_cache(maxsize=64)
 def _gaussian(count: int, length: float) -> np.ndarray:
     """Return the Gaussian correlations of places on a line, of a length [pixels], shape [n, n]."""
     correlation = np.exp(-0.5 * (np.arange(count) / length) ** 2)
-    return np.asarray(toeplitz(np.where(correlation > _UNCORRELATED, correlation, 0.0)))
+    matrix = np.asarray(toeplitz(np.where(correlation > _UNCORRELATED, correlation, 0.0)))
+    matrix.flags.writeable = False
+    return matrix
 
 
 def _fields(linearized: Linearized, squares: _Squares, resolution: float) -> dict[str, Field]:
@@ -375,9 +399,9 @@ def _fields(linearized: Linearized, squares: _Squares, resolution: float) -> dic
     used, noise = squares.used, np.sqrt(squares.mean(linearized.variance))
     brightness = np.maximum(squares.mean(linearized.brightness), 0.0)
     slope = np.hypot(*np.gradient(brightness))
-    length = _LIGHT_LENGTH * resolution / squares.side
+    length = squares.length(_LIGHT_LENGTH * resolution)
     fields: dict[str, Field] = {"white": WhiteField(int(used.sum()))}
-    fields |= {f"noise_{x:g}": StationaryField(used, np.ones(used.shape), x) for x in _NOISE_LENGTHS}
+    fields |= {f"noise_{x:g}": StationaryField(used, np.ones(used.shape), squares.length(x)) for x in _NOISE_LENGTHS}
     fields |= {"brightness": StationaryField(used, brightness / noise, length)}
     fields |= {"rims": StationaryField(used, slope / noise, length)}
     return fields

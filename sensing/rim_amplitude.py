@@ -64,7 +64,8 @@ def rim_amplitude(instrument: Instrument, star: StarSolution) -> RimAmplitude | 
     state = np.concatenate([np.zeros(len(unknowns)), wave])
     curvature = columns.T @ columns * np.outer(scales, scales) + np.diag(prior)
     scale = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
-    cross, gradient = scales * (columns.T @ light_column) / scale, (scales * (columns.T @ residual) - prior * state) / scale
+    cross = scales * (columns.T @ light_column) / scale
+    gradient = (scales * (columns.T @ residual) - prior * state) / scale
     solved = np.linalg.pinv(curvature / np.outer(scale, scale), rcond=1e-12, hermitian=True) @ np.stack(
         [cross, gradient], axis=1
     )
