@@ -35,7 +35,7 @@ from scipy.optimize import nnls
 from .likelihood import Linearized
 
 #: Correlation lengths of noise [pixels of the fit].
-_NOISE_LENGTHS = (0.5, 0.8, 1.5)
+_NOISE_LENGTHS = (0.5, 0.8, 1.25, 2.0)
 #: Correlation length of brightness and rims over the resolution of the image: a Gaussian of nearly its width. Longer
 #: ones take up most of what the unknowns do, and claim more than is seen of wrong spiders and rims.
 _LIGHT_LENGTH = 0.35
@@ -315,8 +315,12 @@ class _Residuals:
                 products[b, a] = products[a, b]
         freedom = self._pulls.size - float(np.vdot(self._columns, self._columns))
         level = max(float(self._pulls @ self._pulls) / max(freedom, 1.0), 1.0)
-        strengths = _needed_strengths(products, surplus, level)
-        return sum((s * inner[k] for k, s in strengths.items()), start=np.zeros_like(inner[0]))
+        correlated = range(1, 1 + len(_NOISE_LENGTHS))
+        strengths = _needed_strengths(products, surplus, level, correlated)
+        power = sum((s * inner[k] for k, s in strengths.items()), start=np.zeros_like(inner[0]))
+        # Noise is correlated in pixels: in changes of the image, which are smooth, it is no less than without.
+        values, vectors = np.linalg.eigh(power)
+        return np.asarray(vectors * np.maximum(values, 0.0) @ vectors.T)
 
 
 class WhiteField:
@@ -407,11 +411,12 @@ def _fields(linearized: Linearized, squares: _Squares, resolution: float) -> dic
     return fields
 
 
-def _needed_strengths(products: np.ndarray, surplus: np.ndarray, level: float) -> dict[int, float]:
+def _needed_strengths(products: np.ndarray, surplus: np.ndarray, level: float, correlated: range) -> dict[int, float]:
     """Return strengths of the fewest fields whose covariance is near to that of the residuals.
 
     Fields are added as long as one explains more than chance; `level` is the power of the residuals over that of noise,
-    by which their own power scatters.
+    by which their own power scatters. The first one is white. With the `correlated` ones of noise it may be negative:
+    the noise of known variance is then correlated itself.
     """
     strengths: dict[int, float] = {}
     gain = 0.0
@@ -419,8 +424,12 @@ def _needed_strengths(products: np.ndarray, surplus: np.ndarray, level: float) -
         trials = []
         for k in np.flatnonzero(surplus > 0.0):
             if int(k) not in strengths:
-                trial = [*strengths, int(k)]
-                values = _strengths(products[np.ix_(trial, trial)], surplus[trial])
+                trial = sorted({*strengths, int(k), *([0] if int(k) in correlated else [])})
+                with_correlated = any(field in correlated for field in trial)
+                least = np.where((np.array(trial) == 0) & with_correlated, -1.0, 0.0)
+                values = _strengths(
+                    products[np.ix_(trial, trial)], surplus[trial], np.where(np.array(trial) == 0, least, 0.0)
+                )
                 explained = float(2.0 * surplus[trial] @ values - values @ products[np.ix_(trial, trial)] @ values)
                 trials.append((explained, dict(zip(trial, map(float, values), strict=True))))
         if not trials:
@@ -431,11 +440,12 @@ def _needed_strengths(products: np.ndarray, surplus: np.ndarray, level: float) -
         gain, strengths = best, best_strengths
 
 
-def _strengths(products: np.ndarray, surplus: np.ndarray) -> np.ndarray:
-    """Return strengths from zero of fields whose covariance is nearest to that of the residuals."""
+def _strengths(products: np.ndarray, surplus: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """Return strengths from least ones of fields whose covariance is nearest to that of the residuals."""
     scale = np.sqrt(np.diag(products))
     normalized = products / np.outer(scale, scale)
     normalized[np.diag_indices_from(normalized)] += _RIDGE
     factor = np.tril(cho_factor(normalized, lower=True)[0])
-    strengths, _ = nnls(factor.T, solve_triangular(factor, surplus / scale, lower=True))
-    return np.asarray(strengths / scale)
+    beyond = (surplus - products @ least) / scale
+    strengths, _ = nnls(factor.T, solve_triangular(factor, beyond, lower=True))
+    return np.asarray(strengths / scale + least)

@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
+from ..core.statistics import RMS_PER_MAD
 from .donut_rays import ZernikeRays
 from .image_model import STRENGTH, LandedLight
 from .light import Instrument, StarLight
@@ -18,6 +19,10 @@ from .solve import Solution
 
 #: Least gain of twice the logarithm of the likelihood by a rim elsewhere: noise makes one in 1e5 of three motions.
 _GAIN = 25.0
+#: Side of the squares whose residuals say how far noise is correlated [pixels], and least number of them: half as wide
+#: as what a rim elsewhere changes is long.
+_SQUARE = 4
+_FEWEST_SQUARES = 50
 #: Least part of the misfit beyond noise that a rim elsewhere explains: where the model lacks other things, or the noise
 #: is larger than given, a rim explains a tenth or two by chance.
 _MISFIT = 0.5
@@ -96,12 +101,13 @@ def with_moved_rims(
         if loss < noise:
             break
         misfit = _MISFIT * max(loss - (noise or 1.0), 0.0) * best.stamp.used.sum()
-        threshold = _GAIN + misfit
+        least = _GAIN * _correlation(best)
+        threshold = least + misfit
         bodies, gains = rim_gains(instrument, best)
         free = [body for body in best.light.free_rims.bodies if body.moved]
         moved = {body.members for body in (*free, *failed)}
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
-        if not gains.max(initial=0.0) > _GAIN + _PROMISING * misfit:
+        if not gains.max(initial=0.0) > least + _PROMISING * misfit:
             break
         limit = best.solution.loss
         if first is None:
@@ -129,6 +135,27 @@ def with_moved_rims(
                 trial = _settled(instrument, solved(light, trial.solution), solved)
         best = trial
     return best
+
+
+def _correlation(fit: RimFit) -> float:
+    """Return the power of the residuals of squares over that of single pixels' noise, at least 1.
+
+    Gains by noise that is correlated are as many times larger. It is that of typical squares: rims are in few of them.
+    """
+    stamp = fit.stamp
+    point = linearized(stamp, fit.solution.stars[0], fit.solution.waves[0])
+    if point is None or stamp.grid.coarse:
+        return 1.0
+    image = np.full(stamp.used.shape, np.nan)
+    image[stamp.used] = point.pulls
+    ny, nx = (n // _SQUARE for n in image.shape)
+    squares = image[: ny * _SQUARE, : nx * _SQUARE].reshape(ny, _SQUARE, nx, _SQUARE).sum(axis=(1, 3)) / _SQUARE
+    sums = squares[np.isfinite(squares)]
+    freedom = len(sums) - point.columns.shape[1]
+    if freedom < _FEWEST_SQUARES:
+        return 1.0
+    typical = (RMS_PER_MAD * float(np.median(np.abs(sums)))) ** 2
+    return max(typical * len(sums) / freedom, 1.0)
 
 
 def _each_freed(
