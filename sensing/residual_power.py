@@ -58,8 +58,6 @@ _SCREENED = ("white", "noise_0.8", "brightness", "rims")
 _MOST_PIXELS = 17_000
 #: Ridge of the normal equations of the strengths, over their diagonal: fields that differ little share the power.
 _RIDGE = 1e-6
-#: Pixels whose changes by all unknowns are multiplied at once.
-_TOGETHER = 512
 #: Correlation that is none: sums of numbers next to zero are slow.
 _UNCORRELATED = 1e-9
 
@@ -95,6 +93,9 @@ class Field(Protocol):
 
     def times(self, columns: np.ndarray) -> np.ndarray:
         """Return the covariance times columns, shape [n_pixel, n]."""
+
+    def times_sums(self, sums: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return the same of sums over pairs of rows and columns by their matrices, [my, mx, n]."""
 
     def product(self, other: Field) -> float:
         """Return the trace of the product of the covariances of two fields."""
@@ -138,17 +139,16 @@ def residual_power(
     beside = None if patterns is None else _Patterns.of(squares.of(patterns), columns, pulls)
     if beside is not None:
         pulls, columns = pulls - beside.columns @ beside.amplitudes, np.hstack([columns, beside.columns])
-    residuals = _Residuals(pulls, columns)
+    n, strength = len(root), 0.0
+    residuals = _Residuals(squares.used, pulls, columns)
     fields = _fields(linearized, squares, resolution)
     if max(residuals.excess(fields[name]) for name in _SCREENED) < _SIGNIFICANT:
-        power = np.zeros((columns.shape[1],) * 2)
+        inner, of_patterns = np.zeros((n, n)), np.zeros((columns.shape[1] - n,) * 2)
     else:
-        power = residuals.power(fields)
-    n, strength = len(root), 0.0
-    inner = power[:n, :n]
+        inner, of_patterns = residuals.power(fields, n)
     if beside is not None:
-        known = np.zeros_like(power[n:, n:]) if expected is None else beside.power_of(squares.of(expected))
-        strength, level = beside.sizes(power[n:, n:] + known)
+        known = np.zeros_like(of_patterns) if expected is None else beside.power_of(squares.of(expected))
+        strength, level = beside.sizes(of_patterns + known)
         inner = inner + level * (np.eye(n) + inner)
     return ResidualPower(root, inner, strength)
 
@@ -179,7 +179,7 @@ class _Patterns:
         shown = variances > _FAINTEST * variances[-1]
         vectors = vectors[:, shown] / np.sqrt(variances[shown])
         amplitudes = vectors.T @ (patterns.T @ pulls)
-        return cls((beside @ vectors).astype(np.float32), amplitudes, variances[shown])
+        return cls(beside @ vectors.astype(np.float32), amplitudes, variances[shown])
 
     def power_of(self, patterns: np.ndarray) -> np.ndarray:
         """Return the covariance of the amplitudes by a field of patterns [n_pixel, k], shape [m, m]."""
@@ -276,51 +276,79 @@ class _Squares:
 
 
 class _Residuals:
-    """Residuals over their noise [n_pixel], and changes of the image by independent unknowns [n_pixel, n]."""
+    """Residuals over their noise [n_pixel], and changes of the image by independent unknowns [n_pixel, n].
 
-    def __init__(self, pulls: np.ndarray, columns: np.ndarray) -> None:
+    What a fit has taken from the power of fields is a small part of it, and computed by sums over pairs of rows and
+    columns, in which the changes are nearly even.
+    """
+
+    def __init__(self, used: np.ndarray, pulls: np.ndarray, columns: np.ndarray) -> None:
         self._pulls, self._columns = pulls, columns
+        pairs = [_pairs(n) for n in used.shape]
+        self._pairs = pairs[0], pairs[1]
+        images = np.zeros((*used.shape, columns.shape[1]), dtype=np.float32)
+        images[used] = columns
+        self._sums = _along_both(*self._pairs, images)
         self._products: dict[int, tuple[Field, np.ndarray]] = {}
+        self._surpluses: dict[int, tuple[Field, float]] = {}
 
-    def _of_columns(self, field: Field) -> np.ndarray:
-        """Return the covariance of a field times the changes of the image."""
+    def _of_sums(self, field: Field) -> np.ndarray:
+        """Return the covariance of a field times the sums of the changes of the image, [n_pair, n]."""
         if id(field) not in self._products:
-            self._products[id(field)] = field, field.times(self._columns)
+            values = field.times_sums(self._sums, *self._pairs)
+            self._products[id(field)] = field, values.reshape(-1, self._sums.shape[-1])
         return self._products[id(field)][1]
 
     def _surplus(self, of_field: Field) -> float:
         """Return the power of the residuals in a field beyond that of noise."""
-        energy = float(self._pulls @ of_field.times(self._pulls[:, None])[:, 0])
-        return energy - of_field.trace + float(np.vdot(self._columns, self._of_columns(of_field)))
+        if id(of_field) not in self._surpluses:
+            energy = float(self._pulls @ of_field.times(self._pulls[:, None])[:, 0])
+            taken = float(np.vdot(self._sums, self._of_sums(of_field)))
+            self._surpluses[id(of_field)] = of_field, energy - of_field.trace + taken
+        return self._surpluses[id(of_field)][1]
 
     def excess(self, of_field: Field) -> float:
         """Return the surplus in a field in standard deviations of noise."""
         return self._surplus(of_field) / np.sqrt(2.0 * of_field.product(of_field))
 
-    def power(self, fields: Mapping[str, Field]) -> np.ndarray:
-        """Return the power of the fields that the residuals need in the unknowns, [n, n]."""
+    def power(self, fields: Mapping[str, Field], n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the power of the fields that the residuals need in the first n unknowns, and in the others."""
         listed = list(fields.values())
-        of_columns = [self._of_columns(of_field) for of_field in listed]
-        inner = [self._columns.T @ values for values in of_columns]
+        of_sums = [self._of_sums(of_field) for of_field in listed]
+        sums = self._sums.reshape(-1, self._sums.shape[-1])
+        inner = [sums.T @ values for values in of_sums]
         surplus = np.array([self._surplus(of_field) for of_field in listed])
-        of_unknowns = np.stack([values.ravel() for values in inner])
-        products = (of_unknowns @ of_unknowns.T).astype(np.float64)
-        # All pairs at once, by parts that stay in the processor's cache.
-        for first in range(0, len(self._columns), _TOGETHER):
-            of_pixels = np.stack([values[first : first + _TOGETHER].ravel() for values in of_columns])
-            products -= 2.0 * (of_pixels @ of_pixels.T)
+        of_unknowns, of_pixels = (np.stack([v.ravel() for v in values]) for values in (inner, of_sums))
+        products = (of_unknowns @ of_unknowns.T - 2.0 * (of_pixels @ of_pixels.T)).astype(np.float64)
         for a in range(len(listed)):
             for b in range(a + 1):
                 products[a, b] += listed[a].product(listed[b])
                 products[b, a] = products[a, b]
         freedom = self._pulls.size - float(np.vdot(self._columns, self._columns))
         level = max(float(self._pulls @ self._pulls) / max(freedom, 1.0), 1.0)
-        correlated = range(1, 1 + len(_NOISE_LENGTHS))
-        strengths = _needed_strengths(products, surplus, level, correlated)
-        power = sum((s * inner[k] for k, s in strengths.items()), start=np.zeros_like(inner[0]))
+        strengths = _needed_strengths(products, surplus, level, range(1, 1 + len(_NOISE_LENGTHS)))
+        power, first = np.zeros((n, n)), self._columns[:, :n]
+        for k, strength in strengths.items():
+            power += strength * (first.T @ listed[k].times(first))
         # Noise is correlated in pixels: in changes of the image, which are smooth, it is no less than without.
         values, vectors = np.linalg.eigh(power)
-        return np.asarray(vectors * np.maximum(values, 0.0) @ vectors.T)
+        others = sum((s * inner[k][n:, n:] for k, s in strengths.items()), start=np.zeros((len(inner[0]) - n,) * 2))
+        return np.asarray(vectors * np.maximum(values, 0.0) @ vectors.T), np.asarray(others)
+
+
+@lru_cache(maxsize=64)
+def _pairs(count: int) -> np.ndarray:
+    """Return the matrix of sums over pairs of n values, of the variance of one by noise, shape [ceil(n/2), n]."""
+    matrix = np.zeros(((count + 1) // 2, count), dtype=np.float32)
+    matrix[np.arange(count) // 2, np.arange(count)] = math.sqrt(0.5)
+    matrix.flags.writeable = False
+    return matrix
+
+
+def _along_both(rows: np.ndarray, columns: np.ndarray, images: np.ndarray) -> np.ndarray:
+    """Return images [ny, nx, n] multiplied by matrices along both axes, [my, mx, n]."""
+    along_rows = (rows @ images.reshape(len(images), -1)).reshape(len(rows), *images.shape[1:])
+    return np.matmul(columns, along_rows)
 
 
 class WhiteField:
@@ -332,6 +360,10 @@ class WhiteField:
     def times(self, columns: np.ndarray) -> np.ndarray:
         """Return the columns; see :class:`Field`."""
         return columns
+
+    def times_sums(self, sums: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return the sums; see :class:`Field`."""
+        return sums
 
     def product(self, other: Field) -> float:
         """Return the trace of the other field; see :class:`Field`."""
@@ -373,10 +405,18 @@ class StationaryField:
         else:
             images = np.zeros(shape, dtype=np.float32)
             images[self._used] = columns * amplitude[self._used]
-        smooth = np.matmul(along, (rows @ images.reshape(shape[0], -1)).reshape(shape))
+        smooth = _along_both(rows, along, images.reshape(shape))
         if not self._even:
             smooth *= amplitude
         return np.asarray(smooth.reshape(columns.shape) if every else smooth[self._used])
+
+    def times_sums(self, sums: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return the covariance of sums times sums; see :class:`Field`."""
+        of_rows, of_columns = self._correlations
+        amplitude = (0.5 * rows @ self._amplitude.astype(np.float32) @ columns.T)[..., None]
+        smooth = _along_both(rows @ of_rows @ rows.T, columns @ of_columns @ columns.T, sums * amplitude)
+        smooth *= amplitude
+        return np.asarray(smooth)
 
     def product(self, other: Field) -> float:
         """Return the trace of the product of the covariances; see :class:`Field`."""
@@ -385,6 +425,8 @@ class StationaryField:
         # The product of two Gaussians is one.
         length = 1.0 / math.hypot(1.0 / self._length, 1.0 / other._length)
         rows, along = (_gaussian(n, length) for n in self._used.shape)
+        if self._even and other._even:
+            return float(rows.sum() * along.sum())
         amplitude = self._amplitude * other._amplitude
         return float((amplitude * (rows @ amplitude @ along)).sum())
 
@@ -427,9 +469,7 @@ def _needed_strengths(products: np.ndarray, surplus: np.ndarray, level: float, c
                 trial = sorted({*strengths, int(k), *([0] if int(k) in correlated else [])})
                 with_correlated = any(field in correlated for field in trial)
                 least = np.where((np.array(trial) == 0) & with_correlated, -1.0, 0.0)
-                values = _strengths(
-                    products[np.ix_(trial, trial)], surplus[trial], np.where(np.array(trial) == 0, least, 0.0)
-                )
+                values = _strengths(products[np.ix_(trial, trial)], surplus[trial], least)
                 explained = float(2.0 * surplus[trial] @ values - values @ products[np.ix_(trial, trial)] @ values)
                 trials.append((explained, dict(zip(trial, map(float, values), strict=True))))
         if not trials:
@@ -446,6 +486,8 @@ def _strengths(products: np.ndarray, surplus: np.ndarray, least: np.ndarray) -> 
     normalized = products / np.outer(scale, scale)
     normalized[np.diag_indices_from(normalized)] += _RIDGE
     factor = np.tril(cho_factor(normalized, lower=True)[0])
-    beyond = (surplus - products @ least) / scale
-    strengths, _ = nnls(factor.T, solve_triangular(factor, beyond, lower=True))
+    beyond = solve_triangular(factor, (surplus - products @ least) / scale, lower=True)
+    strengths = solve_triangular(factor, beyond, lower=True, trans="T")
+    if strengths.min() < 0.0:
+        strengths, _ = nnls(factor.T, beyond)
     return np.asarray(strengths / scale + least)
