@@ -19,9 +19,9 @@ from .solve import Solution
 
 #: Least gain of twice the logarithm of the likelihood by a rim elsewhere: noise makes one in 1e5 of three motions.
 _GAIN = 25.0
-#: Side of the squares whose residuals say how far noise is correlated [pixels], and least number of them: half as wide
-#: as what a rim elsewhere changes is long.
+#: Side of the squares whose residuals say how far noise is correlated [pixels].
 _SQUARE = 4
+#: Least number of such squares beyond that of the unknowns.
 _FEWEST_SQUARES = 50
 #: Least part of the misfit beyond noise that a rim elsewhere explains: where the model lacks other things, or the noise
 #: is larger than given, a rim explains a tenth or two by chance.
@@ -138,20 +138,25 @@ def with_moved_rims(
 
 
 def _correlation(fit: RimFit) -> float:
-    """Return the power of the residuals of squares over that of single pixels' noise, at least 1.
-
-    Gains by noise that is correlated are as many times larger. It is that of typical squares: rims are in few of them.
-    """
-    stamp = fit.stamp
-    point = linearized(stamp, fit.solution.stars[0], fit.solution.waves[0])
-    if point is None or stamp.grid.coarse:
+    """Return by how many times gains are larger than by noise of single pixels, since it is correlated."""
+    point = linearized(fit.stamp, fit.solution.stars[0], fit.solution.waves[0])
+    if point is None or fit.stamp.grid.coarse:
         return 1.0
-    image = np.full(stamp.used.shape, np.nan)
-    image[stamp.used] = point.pulls
+    return power_of_squares(point.pulls, point.used, point.columns.shape[1])
+
+
+def power_of_squares(pulls: np.ndarray, used: np.ndarray, unknowns: int) -> float:
+    """Return the power of residuals in typical squares over that of noise of single pixels, at least 1.
+
+    `pulls` [n_pixel] are residuals of the used pixels over their noise, after a fit of so many unknowns. What a rim
+    elsewhere leaves is in few of the squares.
+    """
+    image = np.full(used.shape, np.nan)
+    image[used] = pulls
     ny, nx = (n // _SQUARE for n in image.shape)
     squares = image[: ny * _SQUARE, : nx * _SQUARE].reshape(ny, _SQUARE, nx, _SQUARE).sum(axis=(1, 3)) / _SQUARE
     sums = squares[np.isfinite(squares)]
-    freedom = len(sums) - point.columns.shape[1]
+    freedom = len(sums) - unknowns
     if freedom < _FEWEST_SQUARES:
         return 1.0
     typical = (RMS_PER_MAD * float(np.median(np.abs(sums)))) ** 2
