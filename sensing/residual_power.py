@@ -9,7 +9,8 @@ covariance of the residuals is
 .. math:: M \Big(I + \sum_k \theta_k R_k\Big) M + A F^{-1} P F^{-1} A^T, \qquad M = I - A F^{-1} A^T.
 
 The strengths :math:`\theta_k \ge 0` are those whose covariance is nearest to :math:`e e^T` (minimum norm quadratic
-estimation; Rao 1971, J. Multivariate Anal. 1, 257), of as few fields as the residuals ask for. Errors of the unknowns
+estimation; Rao 1971, J. Multivariate Anal. 1, 257), of as few fields as the residuals ask for. Beside correlated noise
+that of white noise may be down to -1: the noise of known variance is then correlated itself. Errors of the unknowns
 have the sandwich covariance :math:`F^{-1} + F^{-1} A^T (\sum_k \theta_k R_k) A F^{-1}`, which is never less than that
 of the noise alone.
 
