@@ -40,6 +40,10 @@ class LightRays(Protocol):
     cells: PupilCells  #: points of the pupil and their weights
     rates: np.ndarray  #: derivatives of :meth:`weights` with respect to the shifts of rims [1/m], [n, n_shift]
 
+    @property
+    def count(self) -> int:
+        """Number of unknowns."""
+
     def weights(self, unknowns: np.ndarray) -> np.ndarray:
         """Return fractions of the light of the points, shape [n]."""
 
@@ -109,7 +113,8 @@ class ZernikeRays:
         self._last: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         self._traced: tuple[np.ndarray, np.ndarray] | None = None
         self._spread: tuple[np.ndarray, np.ndarray] | None = None
-        self._straight, self._merged = straight, None
+        self._straight = straight
+        self._merged: ZernikeRays | None = None
         #: Sides of the image of a cell [m], columns of a matrix.
         self.footprint = self.cells.footprint(self._unaberrated(self._middle))
 
@@ -201,6 +206,11 @@ class ZernikeRays:
         smooth = [self.cells.smooth.at(points, places) for places in landing.reshape(-1, len(self.cells), 2)]
         spreads = [moments_beyond(self.footprint, magnification, moments) for _, magnification in smooth]
         return np.concatenate([places for places, _ in smooth]), np.concatenate(spreads)
+
+    @property
+    def count(self) -> int:
+        """Number of unknowns."""
+        return len(self._gradients) + self.rates.shape[1]
 
     def weights(self, unknowns: np.ndarray) -> np.ndarray:
         """Return fractions of the light; see :class:`LightRays`."""

@@ -109,7 +109,7 @@ def _ratios(instrument: Instrument, star: StarSolution, fit: DonutFit, i: int) -
     unknowns[[FLUX, STRENGTH]] = 1.0, star.solution.stars[0][STRENGTH]
     grid = star.full.grid
     rays_alone = star.full if grid.rim_light is None else replace(star.full, grid=grid.of_rays_alone())
-    telescope_image = model_image(rays_alone, unknowns, np.zeros_like(star.solution.waves[0]))
+    telescope_image = model_image(rays_alone, unknowns, np.zeros(star.full.rays.count))
     inner, outer, level = _edges_of_quadrants(image, used)
     model = _edges_of_quadrants(telescope_image, np.ones(telescope_image.shape, dtype=bool))
     pixels = 2.0 * np.pi * np.maximum(inner, _LEAST_PIXELS) / _QUADRANTS

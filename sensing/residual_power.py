@@ -207,12 +207,11 @@ class _Patterns:
             rms = nothing if rms_limits is None else np.linspace(*rms_limits, _STARTS)
             levels = np.linspace(0.0, most, _STARTS) if most else np.zeros(1)
             for _ in range(_ZOOMS):
-                sizes = np.exp(2.0 * rms)[:, None], np.exp(levels)
-                losses = _loss_of_sizes(*(v.ravel() for v in np.broadcast_arrays(*sizes)), energies, variances)
-                row, column = np.unravel_index(int(np.argmin(losses)), (len(rms), len(levels)))
+                field, all_alike = np.broadcast_arrays(np.exp(2.0 * rms)[:, None], np.exp(levels))
+                losses = _loss_of_sizes(field.ravel(), all_alike.ravel(), energies, variances)
+                row, column = divmod(int(np.argmin(losses)), len(levels))
                 best = float(losses.min()), float(rms[row]), float(levels[column])
-                rms = _nearer(rms, row)
-                levels = _nearer(levels, column)
+                rms, levels = _nearer(rms, row), _nearer(levels, column)
             strength, level = math.exp(2.0 * best[1]), 0.0
             if most:
                 # What lies far out is part of it.

@@ -153,7 +153,7 @@ def power_of_squares(pulls: np.ndarray, used: np.ndarray, unknowns: int) -> floa
     """
     image = np.full(used.shape, np.nan)
     image[used] = pulls
-    ny, nx = (n // _SQUARE for n in image.shape)
+    ny, nx = used.shape[0] // _SQUARE, used.shape[1] // _SQUARE
     squares = image[: ny * _SQUARE, : nx * _SQUARE].reshape(ny, _SQUARE, nx, _SQUARE).sum(axis=(1, 3)) / _SQUARE
     sums = squares[np.isfinite(squares)]
     freedom = len(sums) - unknowns
