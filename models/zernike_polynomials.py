@@ -144,7 +144,9 @@ def low_zernike_gradients(noll: np.ndarray, x: np.ndarray, y: np.ndarray, obscur
     count = along.shape[-1]
     powers_x, powers_y = (np.vander(v, count, increasing=True).T for v in (x, y))
     p, q = np.array([(a, b) for a in range(count) for b in range(count - a)]).T
-    return np.asarray(along[noll - 1][..., p, q] @ (powers_x[p] * powers_y[q]))
+    # One product of matrices: one for each term takes several times as long.
+    rows = along[noll - 1][..., p, q]
+    return np.asarray(rows.reshape(-1, len(p)) @ (powers_x[p] * powers_y[q])).reshape(*rows.shape[:2], -1)
 
 
 @lru_cache(maxsize=16)

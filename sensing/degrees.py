@@ -75,6 +75,11 @@ class FreedomRays:
         #: Where the chief ray crosses the plane of the entrance pupil: that of the telescope as it is believed to be.
         self._chief = np.reshape(aimed_points(telescope, direction[None], middle, np.zeros((1, 2))), (1, 2))
 
+    @property
+    def count(self) -> int:
+        """Number of unknowns."""
+        return self._count + self.rates.shape[1]
+
     def landing(self, unknowns: np.ndarray) -> np.ndarray:
         """Return landing points minus that of the chief ray [m], of the telescope with its degrees of freedom."""
         values = self._matrix @ unknowns[: self._count]

@@ -21,11 +21,15 @@ from ..raytrace.aiming import pupil_coordinates
 from ..raytrace.launch import launch_bundles
 from ..raytrace.rays import Rays, RayStatus, parallel_rays
 from ..raytrace.trace import trace
-from ..wavefront.chief_rays import JACOBIAN_STEP
 from ..wavefront.psf.pupil_rims import PupilRims
 from .pupil_cells import PupilCells, moments_beyond
 from .rim_light import RimsAt
 
+#: Distance that light has moved by since it was traced, over the side of the image of a cell, up to which it is taken
+#: to have moved by its response: this is right to a thousandth, which is 1e-4 pixels.
+_FOLLOWED = 0.05
+#: Angle by which light is turned for the change of its landing points [rad].
+_TURN = 1e-5
 #: Step of the differences by which aimed pupil points follow those of the entrance pupil, in units of its radius.
 _DIFFERENCE = 1e-4
 
@@ -35,6 +39,10 @@ class LightRays(Protocol):
 
     cells: PupilCells  #: points of the pupil and their weights
     rates: np.ndarray  #: derivatives of :meth:`weights` with respect to the shifts of rims [1/m], [n, n_shift]
+
+    @property
+    def count(self) -> int:
+        """Number of unknowns."""
 
     def weights(self, unknowns: np.ndarray) -> np.ndarray:
         """Return fractions of the light of the points, shape [n]."""
@@ -81,7 +89,7 @@ class ZernikeRays:
         cells: PupilCells,
         noll: np.ndarray,
     ) -> None:
-        self._direction, self._wavelengths = direction, wavelengths
+        self._direction, self._wavelengths, self._fractions = direction, wavelengths, wavelength_weights
         self.cells, self._points = cells, cells.points
         self._weights, self.rates = cells.at_wavelengths(wavelength_weights)
         self._middle = float(wavelengths[len(wavelengths) // 2])
@@ -90,20 +98,52 @@ class ZernikeRays:
         self._set_telescope(telescope)
         self._jacobians = [self._jacobian(float(w)) for w in self._wavelengths]
         self._set_response(self._gradients)
+        self._moving = self._single
 
     def _set_telescope(self, telescope: Telescope) -> None:
         """Have the landing points of light through a telescope."""
         self._telescope = telescope
         self._chief = chief_landing(telescope, self._direction, self._middle)
-        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        self._begin({})
+
+    def _begin(self, straight: dict[float, np.ndarray]) -> None:
+        """Begin with landing points without a wavefront beside the telescope's, where they are at hand."""
+        #: Coefficients and landing points of the last light, with those that it follows, and of the last light that was
+        #: traced; landing points and spread of the last light of which it was computed.
+        self._last: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._traced: tuple[np.ndarray, np.ndarray] | None = None
+        self._spread: tuple[np.ndarray, np.ndarray] | None = None
+        self._straight = straight
+        self._merged: ZernikeRays | None = None
         #: Sides of the image of a cell [m], columns of a matrix.
-        self.footprint = self.cells.footprint(self._landing(self._middle, np.zeros((1, 1, 2)))[0])
+        self.footprint = self.cells.footprint(self._unaberrated(self._middle))
 
     def through(self, telescope: Telescope) -> ZernikeRays:
         """Return the light of the same cells of the pupil, of the same response, through a telescope out of focus."""
         rays = copy(self)
         rays._set_telescope(telescope)
         return rays
+
+    def merged(self) -> ZernikeRays:
+        """Return the light of squares of two by two cells, for images that are coarse enough."""
+        if self._merged is None:
+            merging = self.cells.merging()
+
+            def mean(values: np.ndarray) -> np.ndarray:
+                """Return means of values of the cells [..., n]."""
+                return np.asarray((merging @ values.reshape(-1, values.shape[-1]).T).T.reshape(*values.shape[:-1], -1))
+
+            rays = copy(self)
+            rays.cells = self.cells.merged(merging)
+            rays._points = rays.cells.points
+            rays._weights, rays.rates = rays.cells.at_wavelengths(self._fractions)
+            rays._gradients = mean(self._gradients)
+            rays._jacobians = [np.moveaxis(mean(np.moveaxis(j, 1, 2)), 2, 1) for j in self._jacobians]
+            rays._begin({w: mean(landing.T).T for w, landing in self._straight.items()})
+            rays._set_response(rays._gradients)
+            rays._moving = rays._single
+            self._merged = rays
+        return self._merged
 
     def _landing(self, wavelength: float, slopes: np.ndarray) -> np.ndarray:
         """Return detector x and y [m] of rays, [m, n, 2], with direction cosines changed by slopes [m, n or 1, 2]."""
@@ -117,22 +157,28 @@ class ZernikeRays:
             cosines.shape
         )
 
+    def _unaberrated(self, wavelength: float) -> np.ndarray:
+        """Return landing points without a wavefront beside the telescope's, shape [n, 2]."""
+        if wavelength not in self._straight:
+            self._straight[wavelength] = self._landing(wavelength, np.zeros((1, 1, 2)))[0]
+        return self._straight[wavelength]
+
     def _jacobian(self, wavelength: float) -> np.ndarray:
         """Return J(p), shape [direction axis, n_point, detector axis]."""
-        steps = JACOBIAN_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-        along = self._landing(wavelength, steps[:, None])
-        return np.asarray((along[0::2] - along[1::2]) / (2.0 * JACOBIAN_STEP))
+        # Differences to one side are off by 1e-5: light turns by as much as it lands elsewhere.
+        along = self._landing(wavelength, _TURN * np.eye(2)[:, None])
+        return np.asarray((along - self._unaberrated(wavelength)) / _TURN)
 
     def _set_response(self, gradients: np.ndarray) -> None:
         """Have the response to terms of these gradients [n_term, 2, n_point]."""
         x, y = np.moveaxis(gradients, 1, 0)
+        x, y = (np.ascontiguousarray(v.T, dtype=np.float32) for v in (x, y))
         products = [
-            np.stack([jacobian[0, :, i, None] * x.T + jacobian[1, :, i, None] * y.T for i in range(2)])
-            for jacobian in self._jacobians
+            np.stack([-jacobian[0, :, i, None] * x - jacobian[1, :, i, None] * y for i in range(2)])
+            for jacobian in (j.astype(np.float32) for j in self._jacobians)
         ]
-        self._response = -np.concatenate(products, axis=1)
-        self._single = self._response.astype(np.float32)
-        self._rims = RimsOfCells(self.cells, self._response)
+        self._single = np.concatenate(products, axis=1)
+        self._rims = RimsOfCells(self.cells, self._single)
 
     def responding_to(self, noll: np.ndarray) -> ZernikeRays:
         """Return the same light for the same unknowns, with the response to other terms that it does not have."""
@@ -161,6 +207,11 @@ class ZernikeRays:
         spreads = [moments_beyond(self.footprint, magnification, moments) for _, magnification in smooth]
         return np.concatenate([places for places, _ in smooth]), np.concatenate(spreads)
 
+    @property
+    def count(self) -> int:
+        """Number of unknowns."""
+        return len(self._gradients) + self.rates.shape[1]
+
     def weights(self, unknowns: np.ndarray) -> np.ndarray:
         """Return fractions of the light; see :class:`LightRays`."""
         return self._weights + self.rates @ unknowns[len(self._gradients) :]
@@ -176,14 +227,30 @@ class ZernikeRays:
         coefficients = unknowns[: len(self._gradients)]
         # Several images of one wavefront follow each other.
         if self._last is None or not np.array_equal(self._last[0], coefficients):
-            slopes = -np.tensordot(coefficients, self._gradients, axes=1).T[None]
-            landing = np.concatenate([self._landing(float(w), slopes)[0] for w in self._wavelengths]) - self._chief
-            self._last = (coefficients.copy(), landing)
+            self._last = (coefficients.copy(), *self._landing_near(coefficients))
         return self._last[1]
+
+    def _landing_near(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return landing points, and those of the light that they follow by its response, or they themselves."""
+        if not coefficients.any():
+            straight = np.concatenate([self._unaberrated(float(w)) for w in self._wavelengths]) - self._chief
+            return straight, straight
+        if self._traced is not None:
+            moved = (self._moving @ (coefficients - self._traced[0]).astype(np.float32)).T
+            limit = _FOLLOWED**2 * abs(float(np.linalg.det(self.footprint)))
+            if float(np.abs(self._weights) @ (moved**2).sum(axis=1)) < limit:
+                return self._traced[1] + moved, self._traced[1]
+        slopes = -np.tensordot(coefficients, self._gradients, axes=1).T[None]
+        landing = np.concatenate([self._landing(float(w), slopes)[0] for w in self._wavelengths]) - self._chief
+        self._traced = (coefficients.copy(), landing)
+        return landing, landing
 
     def spread(self, landing: np.ndarray) -> np.ndarray:
         """Return the spread of the image of each point; see :class:`LightRays`."""
-        return spread_of(self.cells, landing, self.footprint)
+        traced = self._last[2] if self._last is not None and landing is self._last[1] else landing
+        if self._spread is None or self._spread[0] is not traced:
+            self._spread = (traced, spread_of(self.cells, traced, self.footprint))
+        return self._spread[1]
 
     def at_rims(self, rims: PupilRims, landing: np.ndarray, response: np.ndarray | None) -> RimsAt:
         """Return the rims on the detector; see :class:`LightRays`."""

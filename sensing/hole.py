@@ -52,10 +52,18 @@ _POINTS = 4001
 def warn_of_other_hole(instrument: Instrument, solutions: dict[int, StarSolution], fit: DonutFit) -> None:
     """Warn where donuts have another obscuration than the light of the telescope, all around."""
     telescope = instrument.telescope
+    donut, model = _brightest_ratios(instrument, solutions, fit)
+    # An image of the telescope that has no hole tells no scale.
+    scaled = model > 0.0
+    relative = np.where(scaled, donut / np.where(scaled, model, 1.0) - 1.0, np.nan)
+    # Obscurations are below 1, and differ by no more than these do.
+    alike = np.abs(relative) <= _DIFFERENCE
+    if not len(donut) or alike.any() or (np.nanmin(relative, initial=0.0) < 0.0 < np.nanmax(relative, initial=0.0)):
+        return
     lit = lit_obscuration(telescope, instrument.middle)
-    shown = donut_obscurations(instrument, solutions, fit, lit)
+    shown = np.where(scaled, lit * (1.0 + relative), donut)
     differences = shown - lit
-    if len(shown) and (np.abs(differences) > _DIFFERENCE).all() and np.ptp(np.sign(differences)) == 0.0:
+    if (np.abs(differences) > _DIFFERENCE).all() and np.ptp(np.sign(differences)) == 0.0:
         text = (
             f"{telescope.name}: donuts show an obscuration of {np.median(shown):.2f}, its light has {lit:.2f}: "
             "expected the annulus of the mirror, and pupil.obscuration, as they are; Zernikes are wrong"
@@ -63,20 +71,18 @@ def warn_of_other_hole(instrument: Instrument, solutions: dict[int, StarSolution
         warnings.warn(text, PrescriptionWarning, stacklevel=4)
 
 
-def donut_obscurations(
-    instrument: Instrument, solutions: dict[int, StarSolution], fit: DonutFit, lit: float
-) -> np.ndarray:
-    """Return the obscurations that the brightest donuts show in each quadrant, shape [n, 4].
+def _brightest_ratios(
+    instrument: Instrument, solutions: dict[int, StarSolution], fit: DonutFit
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return inner over outer radii of the brightest donuts and of the telescope's images, quadrants, each [n, 4].
 
-    Donuts without clear edges are left out; `lit` is the obscuration of the light of the telescope.
+    Donuts without clear edges are left out.
     """
     clear = [i for i in solutions if not DonutFlag(int(fit.flags[i])) & _UNFIT]
     brightest = sorted(clear, key=lambda i: -fit.flux[i])[:_DONUTS]
     ratios = np.array([_ratios(instrument, solutions[i], fit, i) for i in brightest]).reshape(-1, 2, _QUADRANTS)
-    donut, model = np.moveaxis(ratios, 1, 0)
-    # An image of the telescope that has no hole tells no scale.
-    shown = np.where(model > 0.0, donut * lit / np.where(model > 0.0, model, 1.0), donut)
-    return shown[np.isfinite(shown).all(axis=1)]
+    donut, model = np.moveaxis(ratios[np.isfinite(ratios).all(axis=(1, 2))], 1, 0)
+    return donut, model
 
 
 def lit_obscuration(telescope: Telescope, wavelength: float) -> float:
@@ -86,8 +92,8 @@ def lit_obscuration(telescope: Telescope, wavelength: float) -> float:
     except DomainError:
         return np.nan
     image = _image(cells.points / cells.side, cells.weights, _CELLS + 5, 2.0)
-    inner, outer, _ = _edges(image, np.ones(image.shape, dtype=bool), np.zeros(2))
-    return inner / outer
+    ((inner, outer, _),) = _edges(image, np.zeros(image.shape, dtype=np.int64), np.zeros(2), 1)
+    return float(inner / outer)
 
 
 def _ratios(instrument: Instrument, star: StarSolution, fit: DonutFit, i: int) -> list[np.ndarray]:
@@ -95,13 +101,15 @@ def _ratios(instrument: Instrument, star: StarSolution, fit: DonutFit, i: int) -
 
     NaN where the edges are not clear.
     """
-    image, used, pixel, light = fit.images[i] - fit.background[i], fit.used[i], instrument.pixel, star.light
+    pixel, light = instrument.pixel, star.light
+    rows, columns = (slice(*(np.flatnonzero(fit.used[i].any(axis=axis))[[0, -1]] + [0, 1])) for axis in (1, 0))
+    image, used = fit.images[i][rows, columns] - fit.background[i], fit.used[i][rows, columns]
     fwhm = fit.fwhm[i] * light.scale / pixel
     unknowns = np.zeros(len(NUISANCES))
     unknowns[[FLUX, STRENGTH]] = 1.0, star.solution.stars[0][STRENGTH]
     grid = star.full.grid
     rays_alone = star.full if grid.rim_light is None else replace(star.full, grid=grid.of_rays_alone())
-    telescope_image = model_image(rays_alone, unknowns, np.zeros_like(star.solution.waves[0]))
+    telescope_image = model_image(rays_alone, unknowns, np.zeros(star.full.rays.count))
     inner, outer, level = _edges_of_quadrants(image, used)
     model = _edges_of_quadrants(telescope_image, np.ones(telescope_image.shape, dtype=bool))
     pixels = 2.0 * np.pi * np.maximum(inner, _LEAST_PIXELS) / _QUADRANTS
@@ -117,12 +125,13 @@ def _edges_of_quadrants(image: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Return inner and outer edges [pixels] of the quadrants about the middle of the light, and levels, [3, 4]."""
     y, x = (np.arange(n) - 0.5 * (n - 1) for n in image.shape)
     smooth = gaussian_filter(np.where(used, image, 0.0), _SMOOTH)
-    bright = smooth > 0.5 * _level(smooth, np.maximum(smooth, 0.0))
+    lit = smooth[smooth > 0.0]
+    bright = smooth > 0.5 * _level(lit, lit)
     row, column = np.nonzero(bright)
     center = np.array([x[column].mean(), y[row].mean()]) if len(row) else np.zeros(2)
     right, upper = x[None] > center[0], y[:, None] > center[1]
-    quadrants = [used & (right == first) & (upper == second) for first in (True, False) for second in (True, False)]
-    return np.array([_edges(image, quadrant, center) for quadrant in quadrants]).T
+    quadrant = np.where(used, 2 * right + upper, _QUADRANTS)
+    return _edges(image, quadrant, center, _QUADRANTS).T
 
 
 def _edge_shift(blur: float, unit: float) -> float:
@@ -146,16 +155,28 @@ def _image(places: np.ndarray, weights: np.ndarray, size: int, fwhm: float) -> n
     return np.asarray(gaussian_filter(counts, fwhm / FWHM_PER_RMS))
 
 
-def _edges(image: np.ndarray, used: np.ndarray, center: np.ndarray) -> tuple[float, float, float]:
-    """Return inner and outer edge [pixels] of the mean profile about a place from the middle, and its level.
+def _edges(image: np.ndarray, part: np.ndarray, center: np.ndarray, count: int) -> np.ndarray:
+    """Return inner and outer edges [pixels] of mean profiles about a place from the middle, and levels, [count, 3].
 
-    Without a hole the inner edge is 0; without light all are NaN.
+    Each pixel is of one of so many parts of the image, or of none. Without a hole the inner edge is 0; without light
+    all are NaN.
     """
     y, x = (np.arange(n) - 0.5 * (n - 1) for n in image.shape)
-    ring = np.hypot(x[None] - center[0], y[:, None] - center[1]).astype(int)
-    ring, values = ring[used], image[used]
-    pixels = np.bincount(ring, minlength=2)
-    light = np.bincount(ring, weights=values, minlength=2)
+    radius = np.hypot(x[None] - center[0], y[:, None] - center[1]).astype(np.int64)
+    rings = max(int(radius.max(initial=0)) + 1, 2)
+    ring = (np.minimum(part, count) * rings + radius).ravel()
+    shape = (count + 1, rings)
+    pixels, light = (
+        np.bincount(ring, weights=weights, minlength=shape[0] * rings).reshape(shape)[:count]
+        for weights in (None, image.ravel())
+    )
+    return np.array([_edges_of_profile(light[k], pixels[k]) for k in range(count)])
+
+
+def _edges_of_profile(light: np.ndarray, pixels: np.ndarray) -> tuple[float, float, float]:
+    """Return inner and outer edge and level of a profile, from the light of rings of so many pixels."""
+    last_ring = int(np.flatnonzero(pixels).max(initial=0))
+    light, pixels = light[: last_ring + 1], pixels[: last_ring + 1]
     profile = light / np.maximum(pixels, 1)
     level = _level(profile, np.maximum(light, 0.0))
     if not level > 0.0:
@@ -177,4 +198,4 @@ def _level(values: np.ndarray, light: np.ndarray) -> float:
     """Return the median of values over the light that they stand for; NaN without light."""
     order = np.argsort(values, axis=None)
     below = np.cumsum(light.ravel()[order])
-    return float(values.ravel()[order][np.searchsorted(below, 0.5 * below[-1])]) if below[-1] > 0.0 else np.nan
+    return float(values.ravel()[order][np.searchsorted(below, 0.5 * below[-1])]) if below[-1:] > 0.0 else np.nan

@@ -151,6 +151,8 @@ class ImageGrid:
         self._edge_exponent = float(seeing.exponent(np.array([edge]))[0])
         #: Derivatives of the image at the point where they were computed last.
         self.last: object = None
+        #: Linear model of a stamp at the last point.
+        self.point: object = None
         self._core: SharpCore | None = None
         if sharp:
             core = pixels.width / pixels.side, blur / pixel, footprint / pixel
@@ -163,13 +165,13 @@ class ImageGrid:
     def of_rays_alone(self) -> ImageGrid:
         """Return the grid without diffraction."""
         grid = copy(self)
-        grid.last, grid.rim_light = None, None
+        grid.last, grid.point, grid.rim_light = None, None, None
         return grid
 
     def with_rims(self, rims: PupilRims) -> ImageGrid:
         """Return the grid for other rims of the pupil."""
         grid = copy(self)
-        grid.last = None
+        grid.last, grid.point = None, None
         grid.rim_light = None if self.rim_light is None else self.rim_light.of(rims)
         return grid
 

@@ -172,8 +172,8 @@ class Instrument:
         diameter = 2.0 * float(np.hypot(*place.T).max()) * (1.0 + 1.0 / _SURVEY)
         diffracting = None
         if self.model.diffraction:
-            pieces = math.ceil(_PIECES_A_PIXEL * diameter / self.pixel)
-            diffracting = pupil_rims(telescope, direction, self.middle, min(max(pieces, _FEWEST_PIECES), PIECES))
+            pieces = diffracting_pieces(diameter / self.pixel)
+            diffracting = pupil_rims(telescope, direction, self.middle, pieces)
         rims = movable_rims(telescope, points, ends)
         light = StarLight(telescope, direction, diameter, depth, jacobian, rims, diffracting)
         if not self.model.rims.size:
@@ -225,6 +225,11 @@ class Instrument:
         across = self.model.n_pupil or min(max(math.ceil(finer * light.diameter / spacing), _FEWEST), _MOST)
         return Sampling(sharp, across)
 
+    def may_merge(self, light: StarLight, pixels: Pixels, rays: ZernikeRays) -> bool:
+        """Return whether smoothed pixels blur images so much that larger cells of the pupil are fine enough."""
+        cell = math.sqrt(abs(float(np.linalg.det(rays.footprint))))
+        return pixels.blur > 0.0 and 2.0 * cell < _SPACING * self._width(light, pixels, 0.0)
+
     def binning(self, light: StarLight, pixels: Pixels, fwhm: float) -> int:
         """Return how many pixels along each axis are summed for the fit of a star in a seeing [rad].
 
@@ -262,6 +267,11 @@ class Instrument:
             pixels, self.pixel, self.seeing, light.jacobian, blur, rays.footprint, sharp, reach, light.pupil_rims
         )
         return Stamp(pixels.image, pixels.variance, pixels.used, grid, rays)
+
+
+def diffracting_pieces(pixels: float) -> int:
+    """Return into how many pieces the diffracting rims of a donut of so many pixels across are divided."""
+    return min(max(math.ceil(_PIECES_A_PIXEL * pixels), _FEWEST_PIECES), PIECES)
 
 
 def _survey(telescope: Telescope, across: int) -> np.ndarray:

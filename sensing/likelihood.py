@@ -8,7 +8,7 @@ constant, :math:`\sum (d + s) \ln(m + s) - (m + s)` with data d, model m and sky
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -54,7 +54,7 @@ class Stamp:
 
     def forget(self) -> None:
         """Free the derivatives of the last linear model."""
-        self.grid.last = None
+        self.grid.last = self.grid.point = None
 
     def release(self) -> None:
         """Free what the model can compute again."""
@@ -148,6 +148,21 @@ class _Derivatives:
         )
 
 
+@dataclass(frozen=True)
+class _Point:
+    """The last linear model of a stamp, and its unknowns: checks of a solution follow each other."""
+
+    stamp: Stamp
+    unknowns: np.ndarray
+    wave: np.ndarray
+    linearized: Linearized
+
+    def is_of(self, stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> bool:
+        """Return whether it is that of a stamp at unknowns."""
+        same = np.array_equal(self.unknowns, unknowns) and np.array_equal(self.wave, wave)
+        return self.stamp is stamp and same
+
+
 def _derivatives(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> tuple[np.ndarray, ...] | None:
     """Return image, derivatives and scales; None where light has no direction or misses the telescope."""
     last, landing = stamp.grid.last, stamp.rays.landing(wave)
@@ -167,6 +182,9 @@ def _derivatives(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> tuple[
 
 def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Linearized | None:
     """Return the linear model of a stamp about unknowns; None where light has no direction or misses the telescope."""
+    last = stamp.grid.point
+    if isinstance(last, _Point) and last.is_of(stamp, unknowns, wave):
+        return last.linearized
     derivatives = _derivatives(stamp, unknowns, wave)
     if derivatives is None:
         return None
@@ -178,7 +196,9 @@ def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Lineariz
     root = (1.0 / np.sqrt(variance[used].ravel())).astype(np.float32)
     scaled = columns[used].reshape(len(root), -1) * root[:, None]
     brightness = unknowns[FLUX] * columns[..., FLUX].astype(np.float64)
-    return Linearized(model, variance, brightness, stamp.used, residual, residual * root, scaled, scales)
+    point = Linearized(model, variance, brightness, stamp.used, residual, residual * root, scaled, scales)
+    stamp.grid.point = _Point(stamp, unknowns.copy(), wave.copy(), point)
+    return point
 
 
 def light_columns(
@@ -210,6 +230,21 @@ def light_columns(
     root = (1.0 / np.sqrt(point.variance[point.used])).astype(np.float32)
     gained = columns[point.used][:, columns.shape[-1] - count :] * root[:, None]
     return gained - np.outer(point.columns[:, FLUX], rates.sum(axis=0).astype(np.float32)), scales[-count:]
+
+
+def wavefront_columns(
+    stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray, point: Linearized, rays: LightRays
+) -> np.ndarray:
+    """Return derivatives by the unknowns that rays respond to, over the noise [per unknown], shape [n_pixel, n_wave].
+
+    They are those at the unknowns of a stamp, with the noise of its linear model there.
+    """
+    landing, response = rays.landing(wave), rays.response(wave)
+    light = _landed(replace(stamp, rays=rays), wave, landing, response)
+    columns, scales = stamp.grid.derivatives(unknowns, light, response, rays.rates[:, :0])[1:]
+    root = (1.0 / np.sqrt(point.variance[point.used])).astype(np.float32)
+    first = len(unknowns)
+    return columns[point.used][:, first:] * (root[:, None] * scales[first:].astype(np.float32))
 
 
 def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> NormalEquations:

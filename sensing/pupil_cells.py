@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
+from scipy.sparse import csr_array
 
 from ..models.telescope import Telescope
 from ..raytrace.launch import aimed_points
@@ -75,6 +76,33 @@ class PupilCells:
         """
         rates = np.zeros((len(self), 0)) if self.rates is None else self.rates
         return np.outer(fractions, self.weights).ravel(), np.kron(fractions[:, None], rates)
+
+    def merging(self) -> csr_array:
+        """Return the means over squares of two by two cells by their light, a sparse matrix [n_merged, n].
+
+        Cells without light stay by themselves, after all others.
+        """
+        place = np.floor((self.points - self.center) / (2.0 * self.side)).astype(np.int64)
+        place -= place.min(axis=0, initial=0)
+        _, group = np.unique(place[:, 0] * (int(place[:, 1].max(initial=0)) + 1) + place[:, 1], return_inverse=True)
+        dark = self.weights == 0.0
+        group[dark] = int(group.max(initial=-1)) + 1 + np.arange(dark.sum())
+        _, group = np.unique(group, return_inverse=True)
+        light = np.bincount(group, weights=self.weights)
+        parts = np.where(dark, 1.0, self.weights / np.where(dark, 1.0, light[group]))
+        return csr_array((parts, (group, np.arange(len(group)))), shape=(len(light), len(group)))
+
+    def merged(self, merging: csr_array) -> PupilCells:
+        """Return the cells merged by a matrix of :meth:`merging`."""
+        points, own_points = merging @ self.points, self.points
+        squares = self.moments + own_points[:, :, None] * own_points[:, None, :]
+        moments = (merging @ squares.reshape(-1, 4)).reshape(-1, 2, 2) - points[:, :, None] * points[:, None, :]
+        sums = merging.copy()
+        sums.data[:] = 1.0
+        rates = None if self.rates is None else sums @ self.rates
+        return PupilCells(
+            points, sums @ self.weights, moments, 2.0 * self.side, self.center, rates, area=0.25 * self.area
+        )
 
     @cached_property
     def smooth(self) -> PupilPolynomials:

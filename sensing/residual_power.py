@@ -9,7 +9,8 @@ covariance of the residuals is
 .. math:: M \Big(I + \sum_k \theta_k R_k\Big) M + A F^{-1} P F^{-1} A^T, \qquad M = I - A F^{-1} A^T.
 
 The strengths :math:`\theta_k \ge 0` are those whose covariance is nearest to :math:`e e^T` (minimum norm quadratic
-estimation; Rao 1971, J. Multivariate Anal. 1, 257), of as few fields as the residuals ask for. Errors of the unknowns
+estimation; Rao 1971, J. Multivariate Anal. 1, 257), of as few fields as the residuals ask for. Beside correlated noise
+that of white noise may be down to -1: the noise of known variance is then correlated itself. Errors of the unknowns
 have the sandwich covariance :math:`F^{-1} + F^{-1} A^T (\sum_k \theta_k R_k) A F^{-1}`, which is never less than that
 of the noise alone.
 
@@ -25,17 +26,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
 from scipy.linalg import cho_factor, eigh, solve_triangular, toeplitz
-from scipy.optimize import minimize, nnls
+from scipy.optimize import nnls
 
 from .likelihood import Linearized
 
 #: Correlation lengths of noise [pixels of the fit].
-_NOISE_LENGTHS = (0.5, 0.8, 1.5)
+_NOISE_LENGTHS = (0.5, 0.8, 1.25, 2.0)
 #: Correlation length of brightness and rims over the resolution of the image: a Gaussian of nearly its width. Longer
 #: ones take up most of what the unknowns do, and claim more than is seen of wrong spiders and rims.
 _LIGHT_LENGTH = 0.35
@@ -47,6 +48,9 @@ _NEEDED = 3.0
 _WORTH = 2.0
 #: Logarithms of the rms of a field of patterns between which the likeliest is searched, in units of itself.
 _RMS_LIMITS = (-5.0, 4.0)
+#: Values of each size that are tried at once, and times that this is done, each between the best one's neighbours.
+_STARTS = 9
+_ZOOMS = 5
 #: Variance of a combination of patterns over the largest one below which it says nothing.
 _FAINTEST = 1e-6
 #: Fields whose power in the residuals decides whether there is any beyond that of noise.
@@ -55,8 +59,6 @@ _SCREENED = ("white", "noise_0.8", "brightness", "rims")
 _MOST_PIXELS = 17_000
 #: Ridge of the normal equations of the strengths, over their diagonal: fields that differ little share the power.
 _RIDGE = 1e-6
-#: Pixels whose changes by all unknowns are multiplied at once.
-_TOGETHER = 512
 #: Correlation that is none: sums of numbers next to zero are slow.
 _UNCORRELATED = 1e-9
 
@@ -92,6 +94,9 @@ class Field(Protocol):
 
     def times(self, columns: np.ndarray) -> np.ndarray:
         """Return the covariance times columns, shape [n_pixel, n]."""
+
+    def times_sums(self, sums: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return the same of sums over pairs of rows and columns by their matrices, [my, mx, n]."""
 
     def product(self, other: Field) -> float:
         """Return the trace of the product of the covariances of two fields."""
@@ -135,17 +140,16 @@ def residual_power(
     beside = None if patterns is None else _Patterns.of(squares.of(patterns), columns, pulls)
     if beside is not None:
         pulls, columns = pulls - beside.columns @ beside.amplitudes, np.hstack([columns, beside.columns])
-    residuals = _Residuals(pulls, columns)
+    n, strength = len(root), 0.0
+    residuals = _Residuals(squares.used, pulls, columns)
     fields = _fields(linearized, squares, resolution)
     if max(residuals.excess(fields[name]) for name in _SCREENED) < _SIGNIFICANT:
-        power = np.zeros((columns.shape[1],) * 2)
+        inner, of_patterns = np.zeros((n, n)), np.zeros((columns.shape[1] - n,) * 2)
     else:
-        power = residuals.power(fields)
-    n, strength = len(root), 0.0
-    inner = power[:n, :n]
+        inner, of_patterns = residuals.power(fields, n)
     if beside is not None:
-        known = np.zeros_like(power[n:, n:]) if expected is None else beside.power_of(squares.of(expected))
-        strength, level = beside.sizes(power[n:, n:] + known)
+        known = np.zeros_like(of_patterns) if expected is None else beside.power_of(squares.of(expected))
+        strength, level = beside.sizes(of_patterns + known)
         inner = inner + level * (np.eye(n) + inner)
     return ResidualPower(root, inner, strength)
 
@@ -176,7 +180,7 @@ class _Patterns:
         shown = variances > _FAINTEST * variances[-1]
         vectors = vectors[:, shown] / np.sqrt(variances[shown])
         amplitudes = vectors.T @ (patterns.T @ pulls)
-        return cls((beside @ vectors).astype(np.float32), amplitudes, variances[shown])
+        return cls(beside @ vectors.astype(np.float32), amplitudes, variances[shown])
 
     def power_of(self, patterns: np.ndarray) -> np.ndarray:
         """Return the covariance of the amplitudes by a field of patterns [n_pixel, k], shape [m, m]."""
@@ -194,33 +198,43 @@ class _Patterns:
             return 0.0, 0.0
         variances, vectors = eigh(np.diag(self.variances), np.eye(count) + power)
         energies = (vectors.T @ self.amplitudes) ** 2
-
-        def loss(sizes: np.ndarray) -> tuple[float, np.ndarray]:
-            """Return the loss at logarithms of the rms of the field and of the variance of all, and its slopes."""
-            level, of_field = np.exp(sizes[1]), np.exp(2.0 * sizes[0]) * variances
-            total = level + of_field
-            slope = 0.5 * (1.0 - energies / total) / total
-            value = 0.5 * (np.log(total) + energies / total).sum()
-            return float(value), np.array([2.0 * slope @ of_field, slope.sum() * level])
-
+        # Amplitudes of the field from next to nothing to far beyond their own size, and the level of all up to the
+        # logarithm of their mean square, beyond it where the field lowers it.
         noise = math.log(max(float(energies.mean()), 1.0))
-        none, searched = (_RMS_LIMITS[0], _RMS_LIMITS[0]), _RMS_LIMITS
-        fits = [(loss(np.array([none[0], 0.0]))[0], 0.0, 0.0)]
-        for rms_limits, most in ((searched, 0.0), (none, noise), (searched, noise + 1.0)):
-            starts = [(min(0.0, rms_limits[1]), start) for start in ((0.0, noise) if most else (0.0,))]
-            bounds = [rms_limits, (0.0, most)]
-            searches = [minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
-            best = min(searches, key=lambda search: search.fun)
-            strength, level = float(np.exp(2.0 * best.x[0])), 0.0
+        fits = [(_loss_of_sizes(np.zeros(1), np.ones(1), energies, variances)[0], 0.0, 0.0)]
+        nothing = np.full(1, _RMS_LIMITS[0])
+        for rms_limits, most in ((_RMS_LIMITS, 0.0), (None, noise), (_RMS_LIMITS, noise + 1.0)):
+            rms = nothing if rms_limits is None else np.linspace(*rms_limits, _STARTS)
+            levels = np.linspace(0.0, most, _STARTS) if most else np.zeros(1)
+            for _ in range(_ZOOMS):
+                field, all_alike = np.broadcast_arrays(np.exp(2.0 * rms)[:, None], np.exp(levels))
+                losses = _loss_of_sizes(field.ravel(), all_alike.ravel(), energies, variances)
+                row, column = divmod(int(np.argmin(losses)), len(levels))
+                best = float(losses.min()), float(rms[row]), float(levels[column])
+                rms, levels = _nearer(rms, row), _nearer(levels, column)
+            strength, level = math.exp(2.0 * best[1]), 0.0
             if most:
                 # What lies far out is part of it.
                 level = max(float((energies - strength * variances).mean()) - 1.0, 0.0)
-            worth = _WORTH * (int(rms_limits is searched) + int(most > 0.0))
-            fits.append((best.fun + worth, strength, level))
+            worth = _WORTH * (int(rms_limits is not None) + int(most > 0.0))
+            fits.append((best[0] + worth, strength, level))
         losses, strengths, levels = np.array(fits).T
         weights = np.exp(losses.min() - losses)
         weights /= weights.sum()
         return float(weights @ strengths), float(weights @ levels)
+
+
+def _loss_of_sizes(strength: np.ndarray, level: np.ndarray, energies: np.ndarray, variances: np.ndarray) -> np.ndarray:
+    """Return the loss of normal amplitudes of given energies [m] by strengths of the field and levels of all, [n]."""
+    total = level[:, None] + strength[:, None] * variances
+    return np.asarray(0.5 * (np.log(total) + energies / total).sum(axis=1))
+
+
+def _nearer(values: np.ndarray, best: int) -> np.ndarray:
+    """Return as many values between those beside the best of evenly spaced ones; a single one as it is."""
+    if len(values) == 1:
+        return values
+    return np.linspace(values[max(best - 1, 0)], values[min(best + 1, len(values) - 1)], len(values))
 
 
 class _Squares:
@@ -234,6 +248,13 @@ class _Squares:
         while used.size / self.side**2 > _MOST_PIXELS and min(used.shape) >= 4 * self.side:
             self.side *= 2
         self.used = np.asarray(self._cut(used[..., None])[..., 0].all(axis=(1, 3)))
+
+    def length(self, pixels: float) -> float:
+        """Return the correlation length [squares] of sums over squares of a field of a length in pixels.
+
+        The second moment of the correlation grows by twice that of a square about its pixels' centres.
+        """
+        return math.sqrt((pixels / self.side) ** 2 + (1.0 - self.side**-2) / 6.0)
 
     def _cut(self, images: np.ndarray) -> np.ndarray:
         """Return images [ny, nx, n] by squares, [ny, side, nx, side, n]."""
@@ -255,47 +276,79 @@ class _Squares:
 
 
 class _Residuals:
-    """Residuals over their noise [n_pixel], and changes of the image by independent unknowns [n_pixel, n]."""
+    """Residuals over their noise [n_pixel], and changes of the image by independent unknowns [n_pixel, n].
 
-    def __init__(self, pulls: np.ndarray, columns: np.ndarray) -> None:
+    What a fit has taken from the power of fields is a small part of it, and computed by sums over pairs of rows and
+    columns, in which the changes are nearly even.
+    """
+
+    def __init__(self, used: np.ndarray, pulls: np.ndarray, columns: np.ndarray) -> None:
         self._pulls, self._columns = pulls, columns
+        pairs = [_pairs(n) for n in used.shape]
+        self._pairs = pairs[0], pairs[1]
+        images = np.zeros((*used.shape, columns.shape[1]), dtype=np.float32)
+        images[used] = columns
+        self._sums = _along_both(*self._pairs, images)
         self._products: dict[int, tuple[Field, np.ndarray]] = {}
+        self._surpluses: dict[int, tuple[Field, float]] = {}
 
-    def _of_columns(self, field: Field) -> np.ndarray:
-        """Return the covariance of a field times the changes of the image."""
+    def _of_sums(self, field: Field) -> np.ndarray:
+        """Return the covariance of a field times the sums of the changes of the image, [n_pair, n]."""
         if id(field) not in self._products:
-            self._products[id(field)] = field, field.times(self._columns)
+            values = field.times_sums(self._sums, *self._pairs)
+            self._products[id(field)] = field, values.reshape(-1, self._sums.shape[-1])
         return self._products[id(field)][1]
 
     def _surplus(self, of_field: Field) -> float:
         """Return the power of the residuals in a field beyond that of noise."""
-        energy = float(self._pulls @ of_field.times(self._pulls[:, None])[:, 0])
-        return energy - of_field.trace + float(np.vdot(self._columns, self._of_columns(of_field)))
+        if id(of_field) not in self._surpluses:
+            energy = float(self._pulls @ of_field.times(self._pulls[:, None])[:, 0])
+            taken = float(np.vdot(self._sums, self._of_sums(of_field)))
+            self._surpluses[id(of_field)] = of_field, energy - of_field.trace + taken
+        return self._surpluses[id(of_field)][1]
 
     def excess(self, of_field: Field) -> float:
         """Return the surplus in a field in standard deviations of noise."""
         return self._surplus(of_field) / np.sqrt(2.0 * of_field.product(of_field))
 
-    def power(self, fields: Mapping[str, Field]) -> np.ndarray:
-        """Return the power of the fields that the residuals need in the unknowns, [n, n]."""
+    def power(self, fields: Mapping[str, Field], n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the power of the fields that the residuals need in the first n unknowns, and in the others."""
         listed = list(fields.values())
-        of_columns = [self._of_columns(of_field) for of_field in listed]
-        inner = [self._columns.T @ values for values in of_columns]
+        of_sums = [self._of_sums(of_field) for of_field in listed]
+        sums = self._sums.reshape(-1, self._sums.shape[-1])
+        inner = [sums.T @ values for values in of_sums]
         surplus = np.array([self._surplus(of_field) for of_field in listed])
-        of_unknowns = np.stack([values.ravel() for values in inner])
-        products = (of_unknowns @ of_unknowns.T).astype(np.float64)
-        # All pairs at once, by parts that stay in the processor's cache.
-        for first in range(0, len(self._columns), _TOGETHER):
-            of_pixels = np.stack([values[first : first + _TOGETHER].ravel() for values in of_columns])
-            products -= 2.0 * (of_pixels @ of_pixels.T)
+        of_unknowns, of_pixels = (np.stack([v.ravel() for v in values]) for values in (inner, of_sums))
+        products = (of_unknowns @ of_unknowns.T - 2.0 * (of_pixels @ of_pixels.T)).astype(np.float64)
         for a in range(len(listed)):
             for b in range(a + 1):
                 products[a, b] += listed[a].product(listed[b])
                 products[b, a] = products[a, b]
         freedom = self._pulls.size - float(np.vdot(self._columns, self._columns))
         level = max(float(self._pulls @ self._pulls) / max(freedom, 1.0), 1.0)
-        strengths = _needed_strengths(products, surplus, level)
-        return sum((s * inner[k] for k, s in strengths.items()), start=np.zeros_like(inner[0]))
+        strengths = _needed_strengths(products, surplus, level, range(1, 1 + len(_NOISE_LENGTHS)))
+        power, first = np.zeros((n, n)), self._columns[:, :n]
+        for k, strength in strengths.items():
+            power += strength * (first.T @ listed[k].times(first))
+        # Noise is correlated in pixels: in changes of the image, which are smooth, it is no less than without.
+        values, vectors = np.linalg.eigh(power)
+        others = sum((s * inner[k][n:, n:] for k, s in strengths.items()), start=np.zeros((len(inner[0]) - n,) * 2))
+        return np.asarray(vectors * np.maximum(values, 0.0) @ vectors.T), np.asarray(others)
+
+
+@lru_cache(maxsize=64)
+def _pairs(count: int) -> np.ndarray:
+    """Return the matrix of sums over pairs of n values, of the variance of one by noise, shape [ceil(n/2), n]."""
+    matrix = np.zeros(((count + 1) // 2, count), dtype=np.float32)
+    matrix[np.arange(count) // 2, np.arange(count)] = math.sqrt(0.5)
+    matrix.flags.writeable = False
+    return matrix
+
+
+def _along_both(rows: np.ndarray, columns: np.ndarray, images: np.ndarray) -> np.ndarray:
+    """Return images [ny, nx, n] multiplied by matrices along both axes, [my, mx, n]."""
+    along_rows = (rows @ images.reshape(len(images), -1)).reshape(len(rows), *images.shape[1:])
+    return np.matmul(columns, along_rows)
 
 
 class WhiteField:
@@ -307,6 +360,10 @@ class WhiteField:
     def times(self, columns: np.ndarray) -> np.ndarray:
         """Return the columns; see :class:`Field`."""
         return columns
+
+    def times_sums(self, sums: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return the sums; see :class:`Field`."""
+        return sums
 
     def product(self, other: Field) -> float:
         """Return the trace of the other field; see :class:`Field`."""
@@ -348,10 +405,18 @@ class StationaryField:
         else:
             images = np.zeros(shape, dtype=np.float32)
             images[self._used] = columns * amplitude[self._used]
-        smooth = np.matmul(along, (rows @ images.reshape(shape[0], -1)).reshape(shape))
+        smooth = _along_both(rows, along, images.reshape(shape))
         if not self._even:
             smooth *= amplitude
         return np.asarray(smooth.reshape(columns.shape) if every else smooth[self._used])
+
+    def times_sums(self, sums: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return the covariance of sums times sums; see :class:`Field`."""
+        of_rows, of_columns = self._correlations
+        amplitude = (0.5 * rows @ self._amplitude.astype(np.float32) @ columns.T)[..., None]
+        smooth = _along_both(rows @ of_rows @ rows.T, columns @ of_columns @ columns.T, sums * amplitude)
+        smooth *= amplitude
+        return np.asarray(smooth)
 
     def product(self, other: Field) -> float:
         """Return the trace of the product of the covariances; see :class:`Field`."""
@@ -360,14 +425,19 @@ class StationaryField:
         # The product of two Gaussians is one.
         length = 1.0 / math.hypot(1.0 / self._length, 1.0 / other._length)
         rows, along = (_gaussian(n, length) for n in self._used.shape)
+        if self._even and other._even:
+            return float(rows.sum() * along.sum())
         amplitude = self._amplitude * other._amplitude
         return float((amplitude * (rows @ amplitude @ along)).sum())
 
 
+@lru_cache(maxsize=64)
 def _gaussian(count: int, length: float) -> np.ndarray:
     """Return the Gaussian correlations of places on a line, of a length [pixels], shape [n, n]."""
     correlation = np.exp(-0.5 * (np.arange(count) / length) ** 2)
-    return np.asarray(toeplitz(np.where(correlation > _UNCORRELATED, correlation, 0.0)))
+    matrix = np.asarray(toeplitz(np.where(correlation > _UNCORRELATED, correlation, 0.0)))
+    matrix.flags.writeable = False
+    return matrix
 
 
 def _fields(linearized: Linearized, squares: _Squares, resolution: float) -> dict[str, Field]:
@@ -375,19 +445,20 @@ def _fields(linearized: Linearized, squares: _Squares, resolution: float) -> dic
     used, noise = squares.used, np.sqrt(squares.mean(linearized.variance))
     brightness = np.maximum(squares.mean(linearized.brightness), 0.0)
     slope = np.hypot(*np.gradient(brightness))
-    length = _LIGHT_LENGTH * resolution / squares.side
+    length = squares.length(_LIGHT_LENGTH * resolution)
     fields: dict[str, Field] = {"white": WhiteField(int(used.sum()))}
-    fields |= {f"noise_{x:g}": StationaryField(used, np.ones(used.shape), x) for x in _NOISE_LENGTHS}
+    fields |= {f"noise_{x:g}": StationaryField(used, np.ones(used.shape), squares.length(x)) for x in _NOISE_LENGTHS}
     fields |= {"brightness": StationaryField(used, brightness / noise, length)}
     fields |= {"rims": StationaryField(used, slope / noise, length)}
     return fields
 
 
-def _needed_strengths(products: np.ndarray, surplus: np.ndarray, level: float) -> dict[int, float]:
+def _needed_strengths(products: np.ndarray, surplus: np.ndarray, level: float, correlated: range) -> dict[int, float]:
     """Return strengths of the fewest fields whose covariance is near to that of the residuals.
 
     Fields are added as long as one explains more than chance; `level` is the power of the residuals over that of noise,
-    by which their own power scatters.
+    by which their own power scatters. The first one is white. With the `correlated` ones of noise it may be negative:
+    the noise of known variance is then correlated itself.
     """
     strengths: dict[int, float] = {}
     gain = 0.0
@@ -395,8 +466,10 @@ def _needed_strengths(products: np.ndarray, surplus: np.ndarray, level: float) -
         trials = []
         for k in np.flatnonzero(surplus > 0.0):
             if int(k) not in strengths:
-                trial = [*strengths, int(k)]
-                values = _strengths(products[np.ix_(trial, trial)], surplus[trial])
+                trial = sorted({*strengths, int(k), *([0] if int(k) in correlated else [])})
+                with_correlated = any(field in correlated for field in trial)
+                least = np.where((np.array(trial) == 0) & with_correlated, -1.0, 0.0)
+                values = _strengths(products[np.ix_(trial, trial)], surplus[trial], least)
                 explained = float(2.0 * surplus[trial] @ values - values @ products[np.ix_(trial, trial)] @ values)
                 trials.append((explained, dict(zip(trial, map(float, values), strict=True))))
         if not trials:
@@ -407,11 +480,14 @@ def _needed_strengths(products: np.ndarray, surplus: np.ndarray, level: float) -
         gain, strengths = best, best_strengths
 
 
-def _strengths(products: np.ndarray, surplus: np.ndarray) -> np.ndarray:
-    """Return strengths from zero of fields whose covariance is nearest to that of the residuals."""
+def _strengths(products: np.ndarray, surplus: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """Return strengths from least ones of fields whose covariance is nearest to that of the residuals."""
     scale = np.sqrt(np.diag(products))
     normalized = products / np.outer(scale, scale)
     normalized[np.diag_indices_from(normalized)] += _RIDGE
     factor = np.tril(cho_factor(normalized, lower=True)[0])
-    strengths, _ = nnls(factor.T, solve_triangular(factor, surplus / scale, lower=True))
-    return np.asarray(strengths / scale)
+    beyond = solve_triangular(factor, (surplus - products @ least) / scale, lower=True)
+    strengths = solve_triangular(factor, beyond, lower=True, trans="T")
+    if strengths.min() < 0.0:
+        strengths, _ = nnls(factor.T, beyond)
+    return np.asarray(strengths / scale + least)

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..wavefront.psf.pupil_rims import pupil_rims
 from .image_model import STRENGTH, LandedLight
-from .light import Instrument
+from .light import Instrument, diffracting_pieces
 from .likelihood import linearized
 from .star_fitter import SMALLEST_DONUT, StarSolution
 
@@ -45,7 +45,8 @@ def rim_amplitude(instrument: Instrument, star: StarSolution) -> RimAmplitude | 
     unknowns, wave = solution.stars[0], solution.waves[0]
     if unknowns[STRENGTH] == 0.0 or light.diameter < SMALLEST_DONUT * instrument.pixel:
         return None
-    rims = pupil_rims(light.telescope, light.direction, instrument.middle)
+    pieces = diffracting_pieces(light.diameter / stamp.grid.pixel)
+    rims = pupil_rims(light.telescope, light.direction, instrument.middle, pieces)
     point = linearized(stamp, unknowns, wave)
     if point is None:
         return None
@@ -53,17 +54,18 @@ def rim_amplitude(instrument: Instrument, star: StarSolution) -> RimAmplitude | 
     at_rims = stamp.rays.at_rims(rims, landing, None)
     waves = LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing), at_rims)
     diffracted = stamp.grid.diffracting(rims).image(unknowns, waves) - point.model
-    derivatives = point.columns * point.scales
+    columns, scales = point.columns, point.scales.copy()
     if instrument.known_seeing:
-        derivatives[:, STRENGTH] = 0.0
+        scales[STRENGTH] = 0.0
     light_column, residual = diffracted[stamp.used] / np.sqrt(point.variance[stamp.used]), point.pulls
-    prior = np.zeros(derivatives.shape[1])
+    prior = np.zeros(len(scales))
     precision = np.concatenate([instrument.terms.precision, light.shift_precision])
     prior[len(unknowns) :] = precision
     state = np.concatenate([np.zeros(len(unknowns)), wave])
-    curvature = derivatives.T @ derivatives + np.diag(prior)
+    curvature = columns.T @ columns * np.outer(scales, scales) + np.diag(prior)
     scale = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
-    cross, gradient = derivatives.T @ light_column / scale, (derivatives.T @ residual - prior * state) / scale
+    cross = scales * (columns.T @ light_column) / scale
+    gradient = (scales * (columns.T @ residual) - prior * state) / scale
     solved = np.linalg.pinv(curvature / np.outer(scale, scale), rcond=1e-12, hermitian=True) @ np.stack(
         [cross, gradient], axis=1
     )

@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
+from ..core.statistics import RMS_PER_MAD
 from .donut_rays import ZernikeRays
 from .image_model import STRENGTH, LandedLight
 from .light import Instrument, StarLight
@@ -18,6 +19,10 @@ from .solve import Solution
 
 #: Least gain of twice the logarithm of the likelihood by a rim elsewhere: noise makes one in 1e5 of three motions.
 _GAIN = 25.0
+#: Side of the squares whose residuals say how far noise is correlated [pixels].
+_SQUARE = 4
+#: Least number of such squares beyond that of the unknowns.
+_FEWEST_SQUARES = 50
 #: Least part of the misfit beyond noise that a rim elsewhere explains: where the model lacks other things, or the noise
 #: is larger than given, a rim explains a tenth or two by chance.
 _MISFIT = 0.5
@@ -96,12 +101,13 @@ def with_moved_rims(
         if loss < noise:
             break
         misfit = _MISFIT * max(loss - (noise or 1.0), 0.0) * best.stamp.used.sum()
-        threshold = _GAIN + misfit
+        least = _GAIN * _correlation(best)
+        threshold = least + misfit
         bodies, gains = rim_gains(instrument, best)
         free = [body for body in best.light.free_rims.bodies if body.moved]
         moved = {body.members for body in (*free, *failed)}
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
-        if not gains.max(initial=0.0) > _GAIN + _PROMISING * misfit:
+        if not gains.max(initial=0.0) > least + _PROMISING * misfit:
             break
         limit = best.solution.loss
         if first is None:
@@ -129,6 +135,32 @@ def with_moved_rims(
                 trial = _settled(instrument, solved(light, trial.solution), solved)
         best = trial
     return best
+
+
+def _correlation(fit: RimFit) -> float:
+    """Return by how many times gains are larger than by noise of single pixels, since it is correlated."""
+    point = linearized(fit.stamp, fit.solution.stars[0], fit.solution.waves[0])
+    if point is None or fit.stamp.grid.coarse:
+        return 1.0
+    return power_of_squares(point.pulls, point.used, point.columns.shape[1])
+
+
+def power_of_squares(pulls: np.ndarray, used: np.ndarray, unknowns: int) -> float:
+    """Return the power of residuals in typical squares over that of noise of single pixels, at least 1.
+
+    `pulls` [n_pixel] are residuals of the used pixels over their noise, after a fit of so many unknowns. What a rim
+    elsewhere leaves is in few of the squares.
+    """
+    image = np.full(used.shape, np.nan)
+    image[used] = pulls
+    ny, nx = used.shape[0] // _SQUARE, used.shape[1] // _SQUARE
+    squares = image[: ny * _SQUARE, : nx * _SQUARE].reshape(ny, _SQUARE, nx, _SQUARE).sum(axis=(1, 3)) / _SQUARE
+    sums = squares[np.isfinite(squares)]
+    freedom = len(sums) - unknowns
+    if freedom < _FEWEST_SQUARES:
+        return 1.0
+    typical = (RMS_PER_MAD * float(np.median(np.abs(sums)))) ** 2
+    return max(typical * len(sums) / freedom, 1.0)
 
 
 def _each_freed(

@@ -15,7 +15,7 @@ from .air_shape import air_shape
 from .donut_rays import ZernikeRays
 from .image_model import STRENGTH
 from .light import Instrument
-from .likelihood import Linearized, linearized
+from .likelihood import Linearized, linearized, wavefront_columns
 from .residual_power import residual_power
 from .solve import Group, Solution
 from .star_fitter import StarSolution
@@ -253,17 +253,15 @@ class _TermsBeside:
             return columns
         rays = star.stamp.rays
         assert isinstance(rays, ZernikeRays)
-        point = linearized(replace(star.stamp, rays=rays.responding_to(self._beyond)), unknowns, wave)
-        assert point is not None
-        beyond = slice(len(unknowns), len(unknowns) + len(self._beyond))
-        return np.concatenate([columns, point.columns[:, beyond] * point.scales[beyond].astype(np.float32)], axis=1)
+        beyond = wavefront_columns(star.stamp, unknowns, wave, self._point, rays.responding_to(self._beyond))
+        return np.concatenate([columns, beyond], axis=1)
 
     @cached_property
     def patterns(self) -> np.ndarray | None:
         """Changes of the image over the noise by independent parts of air of unit size, [n_pixel, m]; None without."""
         return self._columns @ self._root.astype(np.float32) if len(self._high) else None
 
-    @property
+    @cached_property
     def unfitted(self) -> np.ndarray:
         """Changes of the image over the noise by terms that are not fitted, of the rms that telescopes have."""
         columns = self._columns[:, len(self._instrument.terms.further) :]

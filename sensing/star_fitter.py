@@ -213,6 +213,8 @@ class StarFitter:
         reach = light.diameter * (1.0 if blended else 0.5) if pixels.side > 1 else 0.0
         shared = self._across if self._across < _SHARED * sampling.across else 0
         rays = self._of(light, max(sampling.across, shared))
+        if self.instrument.may_merge(light, pixels, rays):
+            rays = rays.merged()
         return self.instrument.stamp(light, pixels, rays, sampling.sharp, reach)
 
     def mirrored_stamp(self, light: StarLight, start: Start) -> Stamp:

@@ -6,6 +6,9 @@ import numpy as np
 
 #: Degree of the polynomials: landing points of an aberrated telescope are smooth over the pupil.
 _DEGREE = 8
+_POWERS = np.arange(_DEGREE + 1.0)
+#: Powers of x and of y in each monomial.
+_P, _Q = np.array([(a, b) for a in range(_DEGREE + 1) for b in range(_DEGREE + 1 - a)]).T
 
 
 class PupilPolynomials:
@@ -30,13 +33,17 @@ class PupilPolynomials:
 
     def _terms(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return monomials at points [n, 2], shape [m, n], and their derivatives along x and y [1/m], [2, m, n]."""
-        x, y = (points - self._center).T / self._radius
-        p, q = np.array([(a, b) for a in range(_DEGREE + 1) for b in range(_DEGREE + 1 - a)]).T
-        powers_x, powers_y = (np.vander(v, _DEGREE + 1, increasing=True).T.copy() for v in (x, y))
-        slopes_x, slopes_y = (np.zeros_like(powers_x) for _ in range(2))
-        for k in range(1, _DEGREE + 1):
-            slopes_x[k], slopes_y[k] = (k / self._radius * powers[k - 1] for powers in (powers_x, powers_y))
-        return powers_x[p] * powers_y[q], np.stack([slopes_x[p] * powers_y[q], powers_x[p] * slopes_y[q]])
+        powers = np.ones((2, _DEGREE + 1, len(points)))
+        powers[:, 1] = (points - self._center).T / self._radius
+        for k in range(2, _DEGREE + 1):
+            np.multiply(powers[:, k - 1], powers[:, 1], out=powers[:, k])
+        slopes = np.zeros_like(powers)
+        slopes[:, 1:] = powers[:, :-1] * (_POWERS[1:, None] / self._radius)
+        (x, y), (slopes_x, slopes_y) = powers, slopes
+        monomials = np.empty((3, len(_P), len(points)))
+        for out, along_x, along_y in zip(monomials, (x, slopes_x, x), (y, y, slopes_y), strict=True):
+            np.multiply(along_x[_P], along_y[_Q], out=out)
+        return monomials[0], monomials[1:]
 
     def fitted(self, values: np.ndarray) -> np.ndarray:
         """Return the coefficients of values [n, k], shape [m, k]."""

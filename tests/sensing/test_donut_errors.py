@@ -17,6 +17,7 @@ from pachon.sensing.cross_check import cross_checked
 from pachon.sensing.likelihood import Linearized
 from pachon.sensing.noise import measured_noise
 from pachon.sensing.residual_power import residual_power
+from pachon.sensing.rim_search import power_of_squares
 from pachon.sensing.star_errors import ErrorParts
 from pachon.wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
 
@@ -72,7 +73,7 @@ def smooth_columns(size):
 
 # The last one is summed over squares of pixels.
 @pytest.mark.parametrize(
-    ("blur", "variance", "size"), [(0.0, 1.0, 32), (0.0, 1.7, 32), (0.8, 1.0, 32), (0.0, 1.7, 140)]
+    ("blur", "variance", "size"), [(0.0, 1.0, 32), (0.0, 1.7, 32), (0.8, 1.0, 32), (1.5, 1.0, 40), (0.0, 1.7, 140)]
 )
 def test_errors_have_the_power_of_the_residuals(blur, variance, size):
     """Oracle: the sandwich covariance of the noise that was drawn, F^-1 A^T R A F^-1."""
@@ -109,6 +110,20 @@ def test_errors_have_the_power_of_the_residuals(blur, variance, size):
         assert np.linalg.eigvalsh(power).min() > -1e-9 * np.trace(covariance)
         claimed.append(np.trace(covariance + power))
     assert np.mean(claimed) == pytest.approx(true, rel=0.25)
+
+
+def test_correlated_noise_is_told_from_rims():
+    """Closed form: sums of 4 x 4 values of correlation exp(-d^2 / 4 b^2), b the rms of the filter."""
+    white = np.random.default_rng(4).normal(size=(100, 100))
+    used, apart = np.ones(white.shape, bool), np.arange(-3, 4)
+    assert power_of_squares(white.ravel(), used, 0) == pytest.approx(1.0, abs=0.15)
+    noise = gaussian_filter(white, 0.8, mode="wrap")
+    noise /= noise.std()
+    expected = ((1.0 - np.abs(apart) / 4.0) @ np.exp(-(apart**2) / (4.0 * 0.8**2))) ** 2
+    # 625 squares: the typical one is known to a fifteenth.
+    assert power_of_squares(noise.ravel(), used, 0) == pytest.approx(expected, rel=0.2)
+    white[:8] += 30.0
+    assert power_of_squares(white.ravel(), used, 0) < 1.5
 
 
 def test_errors_do_not_depend_on_where_a_search_stopped():

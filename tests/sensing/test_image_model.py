@@ -194,6 +194,7 @@ def test_gradient_by_degrees_of_freedom_has_that_of_the_rims(behind_focus):
     rays = FreedomRays(
         behind_focus, direction, np.array([WAVELENGTH]), np.ones(1), stamp.rays.cells, freedoms, stamp.rays.footprint
     )
+    assert (rays.count, stamp.rays.count) == (3, len(NOLL))
     star, steps = np.array([1e6, 0.0, 0.0, 3.0, 5.0, 0.0, 0.0]), np.array([4.0, 0.4, 0.004])
     image = model_image(replace(stamp, rays=rays), star, 20.0 * steps)
     stamp = replace(stamp, rays=rays, image=image)
