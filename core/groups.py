@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 _Columns = TypeVar("_Columns", bound="DataclassInstance")
 
 
-def slices_of(groups: Sequence[Sequence[Any]]) -> list[slice]:
+def slices_of(groups: Sequence[Sized]) -> list[slice]:
     """Return the slice of each group in their concatenation."""
     slices, first = [], 0
     for group in groups:
