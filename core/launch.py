@@ -18,8 +18,8 @@ from typing import Any
 
 import warp as wp
 
-from .compile_lock import one_compiler
 from .errors import ProductError
+from .file_lock import file_lock
 from .launch_threads import helpers
 from .threads import thread_count
 
@@ -81,7 +81,7 @@ def load_kernels(kernel: wp.Kernel, device: str = "cpu") -> None:
             return
         block = 1 if device == "cpu" else 256
         compiled = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(block)
-        with nullcontext() if compiled.exists() else one_compiler(compiled.with_name(f"{compiled.name}.lock")):
+        with nullcontext() if compiled.exists() else file_lock(compiled.with_name(f"{compiled.name}.lock")):
             if not compiled.exists():
                 name = kernel.module.name.rpartition(".")[2]
                 LOGGER.info("compiling %s for this machine (once)", name)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.core.compile_lock import one_compiler
+from pachon.core.file_lock import file_lock
 from pachon.wavefront.pupil_optics import trace_pupils
 
 FIELDS = np.radians(np.stack(np.meshgrid(np.linspace(-1, 1, 8), np.linspace(-1, 1, 8)), axis=-1).reshape(-1, 2))
@@ -59,11 +59,11 @@ def test_one_process_compiles_and_the_others_wait(tmp_path):
 
     def second():
         entered.set()
-        with one_compiler(tmp_path / "cache" / "kernels.lock"):
+        with file_lock(tmp_path / "cache" / "kernels.lock"):
             order.append("second")
 
     waiting = threading.Thread(target=second)
-    with one_compiler(tmp_path / "cache" / "kernels.lock"):
+    with file_lock(tmp_path / "cache" / "kernels.lock"):
         waiting.start()
         entered.wait()
         waiting.join(0.2)
@@ -74,5 +74,5 @@ def test_one_process_compiles_and_the_others_wait(tmp_path):
 
 def test_without_a_place_for_a_lock_work_goes_on(tmp_path):
     (tmp_path / "file").write_text("")
-    with one_compiler(tmp_path / "file" / "kernels.lock"):
+    with file_lock(tmp_path / "file" / "kernels.lock"):
         pass

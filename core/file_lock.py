@@ -1,4 +1,4 @@
-"""A lock between processes that compile the same kernels: one compiles, the others wait and load what it has left."""
+"""A lock between processes that would make the same file: one makes it, the others wait and take what it has left."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from typing import IO
 
 try:
     import fcntl
-except ImportError:  # Windows: each process compiles for itself.
+except ImportError:  # Windows: each process works for itself.
     fcntl = None  # type: ignore[assignment]
 
-#: Longest wait for another process [s]; the largest module takes 40 s.
+#: Longest wait for another process [s]; the largest module of kernels compiles for 40 s.
 LONGEST_WAIT = 300.0
 #: Time between two attempts [s].
 PAUSE = 0.05
 
 
 @contextmanager
-def one_compiler(path: Path) -> Iterator[None]:
-    """Hold the lock of a file while something is compiled; go on without it where files have no locks."""
+def file_lock(path: Path) -> Iterator[None]:
+    """Hold the lock of a file, which is made and left; go on without it where files have no locks."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = path.open("w")
     except OSError:
-        # What cannot be written is reported by what compiles.
+        # A folder that cannot be written is reported by the work itself.
         yield
         return
     with lock:
