@@ -12,12 +12,14 @@ import tempfile
 import threading
 from collections.abc import Callable
 from concurrent.futures import wait
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import warp as wp
 
 from .errors import ProductError
+from .file_lock import file_lock
 from .launch_threads import helpers
 from .threads import thread_count
 
@@ -78,10 +80,12 @@ def load_kernels(kernel: wp.Kernel, device: str = "cpu") -> None:
         if key in _loaded:
             return
         block = 1 if device == "cpu" else 256
-        if not (Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(block)).exists():
-            name = kernel.module.name.rpartition(".")[2]
-            LOGGER.info("compiling %s for this machine (once)", name)
-        cache_warning = _with_kernel_cache(lambda: wp.load_module(kernel.module, device=device, block_dim=block))
+        compiled = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(block)
+        with nullcontext() if compiled.exists() else file_lock(compiled.with_name(f"{compiled.name}.lock")):
+            if not compiled.exists():
+                name = kernel.module.name.rpartition(".")[2]
+                LOGGER.info("compiling %s for this machine (once)", name)
+            cache_warning = _with_kernel_cache(lambda: wp.load_module(kernel.module, device=device, block_dim=block))
         if cache_warning:
             LOGGER.warning(cache_warning)
         _loaded.add(key)

@@ -1,3 +1,5 @@
+import gc
+import os
 import socket
 import subprocess
 import sys
@@ -6,9 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 import pachon
 from pachon.core.errors import DomainError
+from pachon.core.file_lock import file_lock
 from pachon.core.long_work import Execution
 from pachon.core.products import image_hdu, write_fits
 from pachon.pipeline import focal_plane_stage
@@ -30,10 +34,15 @@ SETTINGS = {
 
 @pytest.fixture(scope="session", autouse=True)
 def coarse_pictures():
-    """Pictures of few pixels: tests look at what is drawn, not at how finely."""
+    """Pictures of few pixels, without a layout of their panels: tests look at what is drawn, not at how finely.
+
+    The layout takes half the time of a picture. The fixture's value is what makes it, for tests of it.
+    """
+    layout = ConstrainedLayoutEngine.execute
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pachon.core.plotting._DPI", 60)
-        yield
+        patch.setattr(ConstrainedLayoutEngine, "execute", lambda self, figure: None)
+        yield layout
 
 
 @pytest.fixture(scope="session")
@@ -174,8 +183,19 @@ def focal_plane_config(tiny):
     return make
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Collect the tests without searches for garbage: there is none among thousands of tests."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+        gc.freeze()
+
+
 def pytest_collection_modifyitems(items):
-    # A finished run takes seconds, and every process makes its own.
+    # A finished run takes seconds.
     for item in items:
         if "finished_run" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.long)
@@ -183,9 +203,12 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session")
 def finished_run(tiny, tmp_path_factory):
-    """The folder of a finished run on one thread; tests only read it."""
-    folder = tmp_path_factory.mktemp("finished") / "run"
-    run(tiny(), folder, execution=Execution(threads=1))
+    """The folder of a finished run on one thread, one for all processes; tests only read it."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "finished" / "run"
+    with file_lock(folder.parent / "lock"):
+        if not (folder / "timings.json").exists():
+            run(tiny(), folder, execution=Execution(threads=1))
     return folder
 
 

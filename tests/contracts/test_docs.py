@@ -48,6 +48,8 @@ WITH_FILES = {
 #: Pages whose examples need another package, and those that take seconds.
 PEERS = {"batoid.md": "batoid", "from_galsim.md": "galsim", "galsim.md": "galsim", "from_piff.md": "piff"}
 SLOW = {
+    "analyses.md",
+    "measuring.md",
     "from_piff.md",
     "donuts.md",
     "statistical_engine.md",

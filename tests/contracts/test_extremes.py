@@ -19,7 +19,7 @@ from test_wrong_arguments import LONG, is_numbers
 from pachon.core.errors import PachonError
 
 #: One of so many calls is made in the short run, and of functions that take a second.
-SHARE = 400
+SHARE = 800
 SHARE_OF_COSTLY = 2000
 COSTLY = ("check_orientation", "choose_glasses", "fit_donuts", "shim")
 #: Packages of public functions, each a part of the long run.

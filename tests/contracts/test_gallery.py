@@ -23,8 +23,18 @@ from pachon.core.stability import PROVISIONAL
 
 DOCS = Path(__file__).parents[2] / "docs"
 GALLERY = sorted((DOCS / "gallery").glob("[0-9]*.py"))
-#: Examples of more than a second; CI builds the pages, and so runs them, all the same.
-LONG = {"20_donuts", "26_run", "27_visits"}
+#: Examples of about a second and more; CI builds the pages, and so runs them, all the same.
+LONG = {
+    "03_wavefront",
+    "08_psf",
+    "10_ghosts",
+    "11_sensitivity",
+    "20_donuts",
+    "22_sky_image",
+    "23_results",
+    "26_run",
+    "27_visits",
+}
 #: Examples whose notebooks end with a desk: design, tolerances, focal plane, donuts, PSF model, visits.
 NOTEBOOKS = {"12_optimise", "13_tolerances", "16_heights", "20_donuts", "26_run", "27_visits"}
 

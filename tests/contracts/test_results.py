@@ -123,9 +123,14 @@ def test_tables_have_units_and_descriptions(results):
             assert table[column].info.description, f"{name}.{column}"
 
 
-@pytest.mark.parametrize("suffix", [".ecsv", ".csv", ".fits", ".parquet"])
-def test_tables_are_written(results, suffix, tmp_path):
-    for name, result in results.items():
+@pytest.mark.parametrize(
+    ("suffix", "every"),
+    [(".ecsv", 3), (".csv", 1), (".fits", 3), (".parquet", 1)]
+    + [pytest.param(suffix, 1, marks=pytest.mark.slow) for suffix in (".ecsv", ".fits")],
+)
+def test_tables_are_written(results, suffix, every, tmp_path):
+    """Every third result in the formats that take longest; all of them in the slow form."""
+    for name, result in list(results.items())[::every]:
         if type(result).write is not Result.write or name in OWN_TABLES:
             continue
         path = tmp_path / f"{name}{suffix}"

@@ -2,12 +2,14 @@
 
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
 import pachon
+from pachon.core.file_lock import file_lock
 from pachon.wavefront.pupil_optics import trace_pupils
 
 FIELDS = np.radians(np.stack(np.meshgrid(np.linspace(-1, 1, 8), np.linspace(-1, 1, 8)), axis=-1).reshape(-1, 2))
@@ -48,3 +50,29 @@ if (child := os.fork()) == 0:
 sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files have no such locks")
+def test_one_process_compiles_and_the_others_wait(tmp_path):
+    # A lock belongs to the open file: two of one process are as those of two processes.
+    entered, order = threading.Event(), []
+
+    def second():
+        entered.set()
+        with file_lock(tmp_path / "cache" / "kernels.lock"):
+            order.append("second")
+
+    waiting = threading.Thread(target=second)
+    with file_lock(tmp_path / "cache" / "kernels.lock"):
+        waiting.start()
+        entered.wait()
+        waiting.join(0.2)
+        order.append("first")
+    waiting.join()
+    assert order == ["first", "second"]
+
+
+def test_without_a_place_for_a_lock_work_goes_on(tmp_path):
+    (tmp_path / "file").write_text("")
+    with file_lock(tmp_path / "file" / "kernels.lock"):
+        pass

@@ -72,13 +72,13 @@ def focal_plane_psf(image):
     return FocalPlanePsf.fit(focal_plane_stars([image]), camera="lsst", ccds=["R22_S11"], threads=1)
 
 
-@pytest.fixture(scope="module")
-def catalogues(image, catalogue, focal_plane_psf):
-    return {
-        "kriging": catalogue,
-        "paper": measure_image(image, recipe=Recipe.of("paper", order=1), threads=1),
-        "focal plane": measure_image(image, psf=focal_plane_psf, threads=1),
-    }
+@pytest.fixture(scope="module", params=["kriging", pytest.param("paper", marks=pytest.mark.slow), "focal plane"])
+def any_catalogue(image, request):
+    if request.param == "kriging":
+        return request.getfixturevalue("catalogue")
+    if request.param == "paper":
+        return measure_image(image, recipe=Recipe.of("paper", order=1), threads=1)
+    return measure_image(image, psf=request.getfixturevalue("focal_plane_psf"), threads=1)
 
 
 def test_stars_of_images_have_honest_noise(image, catalogue):
@@ -108,9 +108,8 @@ def test_blends_within_the_stellar_locus_are_no_stars():
     assert regular_shapes(values[:11], snr[:11], positions[:11]).all()
 
 
-@pytest.mark.parametrize("kind", ["kriging", "paper", "focal plane"])
-def test_gaussian_galaxies_have_their_own_ellipticity(catalogues, image, kind):
-    truth, catalogue = image.objects, catalogues[kind]
+def test_gaussian_galaxies_have_their_own_ellipticity(any_catalogue, image):
+    truth, catalogue = image.objects, any_catalogue
     rows = catalogue.galaxies
     match = match_positions(catalogue.objects.x[rows], catalogue.objects.y[rows], *on_image(truth), 1.0)
     good = (match >= 0) & catalogue.usable
@@ -137,7 +136,7 @@ def test_the_table_has_sky_positions(catalogue, image):
     assert table["ra"].unit == "deg"
 
 
-def test_the_command_writes_catalogue_and_psf(image, catalogue, tmp_path, capsys):
+def test_the_command_writes_catalogue_and_psf(image, catalogue, tmp_path, capsys, monkeypatch):
     image.write(tmp_path / "image.fits")
     assert main(["measure", str(tmp_path / "image.fits"), "--json", "--quiet", "-o", str(tmp_path / "out")]) == 0
     found = json.loads(capsys.readouterr().out)["images"]["image.fits"]
@@ -149,6 +148,7 @@ def test_the_command_writes_catalogue_and_psf(image, catalogue, tmp_path, capsys
     for name in ("image_galaxies.fits", "image_psf.fits"):
         (tmp_path / name).write_bytes((tmp_path / "out" / name).read_bytes())
     given = [str(path) for path in sorted(tmp_path.glob("image*.fits"))]
+    monkeypatch.setattr("pachon.imaging.measure_files.measure_image", lambda read, **_: replace(catalogue, image=read))
     assert main(["measure", *given, "--json", "--quiet", "-o", str(tmp_path / "again")]) == 0
     assert list(json.loads(capsys.readouterr().out)["images"]) == ["image.fits"]
 
@@ -207,12 +207,15 @@ DAMAGES = {
 
 
 @pytest.fixture(scope="module")
-def measured(image, tmp_path_factory):
-    """A folder with two images and their products, and the bytes of these."""
+def measured(image, catalogue, tmp_path_factory):
+    """A folder with two images and their products, and the bytes of these; the second one's are not measured anew."""
     folder = tmp_path_factory.mktemp("measured")
     image.write(folder / "a.fits")
     replace(image, image=image.image + 1.0).write(folder / "b.fits")
-    measure_files([folder / "a.fits", folder / "b.fits"], folder, execution=Execution(threads=1))
+    measure_files([folder / "a.fits"], folder, execution=Execution(threads=1))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pachon.imaging.measure_files.measure_image", lambda read, **_: replace(catalogue, image=read))
+        measure_files([folder / "b.fits"], folder, execution=Execution(threads=1))
     return folder, {path.name: path.read_bytes() for path in folder.glob("*_*.fits")}
 
 
@@ -290,15 +293,19 @@ def test_kinds_of_models_that_do_not_go_together(image, focal_plane_psf, tmp_pat
         assert error.count("\n") == 1
 
 
-def test_what_cannot_be_measured(image, tmp_path, capsys):
+def test_what_cannot_be_measured(image, catalogue, tmp_path, capsys, monkeypatch):
     empty = CcdImage(image.name, 0.0 * image.image, image.variance, image.mask, image.header, image.objects)
     with pytest.raises(PachonError, match="CCD R22_S11: "):
         measure_image(empty)
     empty.write(tmp_path / "empty.fits")
     assert main(["measure", str(tmp_path / "empty.fits"), "--quiet"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
-    # The others go on.
+    # The others go on; the good one has been measured above.
     image.write(tmp_path / "image.fits")
+    monkeypatch.setattr(
+        "pachon.imaging.measure_files.measure_image",
+        lambda read, **options: replace(catalogue, image=read) if read.image.any() else measure_image(read, **options),
+    )
     assert main(["measure", str(tmp_path / "empty.fits"), str(tmp_path / "image.fits"), "--json", "--quiet"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert list(found["images"]) == ["image.fits"]

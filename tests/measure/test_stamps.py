@@ -45,7 +45,7 @@ def test_centring_adds_no_ellipticity(size, offset):
 
 # What pixels of 0.2" do not sample goes with FWHM: measured 5.3e-7, 4.2e-8 and 2.0e-9 in e, 9.5e-7, 6.8e-8 and 2.7e-9
 # in size, all over the pixel; a star measured where it fell shows ten times more of it.
-@pytest.mark.parametrize(("fwhm", "most"), [(0.4, 1e-6), (0.55, 1e-7), (0.7, 5e-9)])
+@pytest.mark.parametrize(("fwhm", "most"), [(0.4, 1e-6), pytest.param(0.55, 1e-7, marks=pytest.mark.slow), (0.7, 5e-9)])
 def test_ellipticity_added_anywhere_in_a_pixel(fwhm, most):
     centre = measure_shapes(kolmogorov(31, 0.0, 0.0, fwhm=fwhm), PIXEL, WEIGHT)
     steps = np.linspace(-0.5, 0.5, 5)

@@ -67,7 +67,9 @@ def test_fourier_images_by_moments(angle):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("angle", [0.0, 1.0, 1.4, 1.75])
+@pytest.mark.parametrize(
+    "angle", [pytest.param(0.0, marks=pytest.mark.slow), 1.0, pytest.param(1.4, marks=pytest.mark.slow), 1.75]
+)
 def test_radius_of_80_percent_of_the_light(angle):
     telescope = pachon.load_telescope("lsst_v3.3_i")
     optic = batoid.Optic.fromYaml("LSST_i.yaml")

@@ -84,7 +84,7 @@ def test_growth_of_stars_with_their_electrons(make, electrons, count, star):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("place", [0.0, 15.0])
+@pytest.mark.parametrize("place", [pytest.param(0.0, marks=pytest.mark.slow), 15.0])
 def test_tree_rings_move_and_stretch_stars(place, star):
     amplitude, period, center = 0.05, 60.0, np.array([-20.0, -1500.0])
     # GalSim's function is of boundaries, ours of light; and it counts pixels from their lower left corner.

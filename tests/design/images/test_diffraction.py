@@ -101,7 +101,10 @@ def test_path_differences_are_those_of_the_reference_sphere(lsst_r, field):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("angle", [(0.0, 0.0), (0.9, -1.1), (0.0, 1.75)])
+@pytest.mark.parametrize(
+    "angle",
+    [pytest.param((0.0, 0.0), marks=pytest.mark.slow), (0.9, -1.1), pytest.param((0.0, 1.75), marks=pytest.mark.slow)],
+)
 def test_fourier_sum_and_huygens_wavelets_agree(angle):
     telescope = pachon.load_telescope("lsst_v3.3_i")
     field = np.deg2rad([angle])

@@ -47,7 +47,9 @@ def _discs(shift: np.ndarray, large: float, small: float) -> np.ndarray:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("obscuration", [0.0, 0.3, 0.62])
+@pytest.mark.parametrize(
+    "obscuration", [pytest.param(0.0, marks=pytest.mark.slow), pytest.param(0.3, marks=pytest.mark.slow), 0.62]
+)
 def test_closed_form_of_an_annulus(obscuration):
     shift = np.array([0.0, 0.05, 0.19, 0.31, 0.5, 0.62, 0.81, 0.95, 1.0, 1.2])
     # A lattice of 1201 points knows areas to a thousandth.

@@ -53,7 +53,7 @@ def irradiance(place, path, amplitude, wavelength, points):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("number", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_images_are_those_of_huygens_integral(lens, number):
     wavelength = lens.default_wavelength
     field = pachon.Request.of(lens).fields[number]

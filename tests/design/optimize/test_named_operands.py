@@ -397,7 +397,7 @@ def test_the_command_measures_what_needs_no_keys(capsys):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("address", ["S1.curvature", "S3.thickness"])
+@pytest.mark.parametrize("address", ["S1.curvature", pytest.param("S3.thickness", marks=pytest.mark.slow)])
 def test_numbers_are_smooth_where_derivatives_are_differences(triplet, address):
     """Central differences of two steps agree: no noise and no jumps at the size of the solver's steps."""
     numbers = {"surface": "S3", "field": EDGE, "pupil": (0.1, 0.7), "first": "S3", "last": "S4"}

@@ -148,7 +148,7 @@ def through_stop(telescope, field, relative):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("field_deg", [(0.0, 0.0), (4.0, 14.0)])
+@pytest.mark.parametrize("field_deg", [pytest.param((0.0, 0.0), marks=pytest.mark.slow), (4.0, 14.0)])
 def test_derivatives_of_landing_points_are_those_of_rays_solved_anew(lens, field_deg):
     """Brute force: lenses with one change, and rays that are searched for through their stops."""
     steps = {

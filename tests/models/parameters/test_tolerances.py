@@ -76,7 +76,7 @@ def test_the_merit_is_the_rms_of_the_wavefront(lsst_r):
 
 
 @pytest.mark.parametrize("merit", ["wavefront", "spots"])
-@pytest.mark.parametrize("compensators", [(), ("Camera_dz", "M2_rx", "M1M3_B2")])
+@pytest.mark.parametrize("compensators", [pytest.param((), marks=pytest.mark.slow), ("Camera_dz", "M2_rx", "M1M3_B2")])
 def test_linear_and_traced_agree(lsst_r, merit, compensators):
     dof = load_degrees_of_freedom("lsst")
 

@@ -87,7 +87,7 @@ def test_heights_far_from_zero_have_a_range_of_their_own(instrument, plane):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("center", [0.0, 11 * UM])
+@pytest.mark.parametrize("center", [pytest.param(0.0, marks=pytest.mark.slow), 11 * UM])
 def test_columns_are_differences_of_the_engine(instrument, plane, center):
     xy = stars(plane, 60, 6)
     fields = instrument.fields(xy)

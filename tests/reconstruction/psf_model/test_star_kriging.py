@@ -52,7 +52,9 @@ def error(images, truth):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("rough", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize(
+    "rough", [pytest.param(0.0, marks=pytest.mark.slow), 0.5, pytest.param(2.0, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize(
     "count", [pytest.param(20, marks=pytest.mark.slow), 40, pytest.param(100, marks=pytest.mark.slow)]
 )

@@ -168,7 +168,9 @@ def test_a_merit_of_ones_own(triplet):
         run_tolerances(triplet, ToleranceFile.model_validate({**content, "method": "linear"}), merit=shortened)
 
 
-@pytest.mark.parametrize("merit", ["wavefront", "ee80", pytest.param("mtf", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "merit", ["wavefront", pytest.param("ee80", marks=pytest.mark.slow), pytest.param("mtf", marks=pytest.mark.slow)]
+)
 def test_other_merits(triplet, merit):
     extra = {"frequency_per_mm": 20.0} if merit == "mtf" else {}
     found = run_tolerances(triplet, file_of(merit=merit, draws=2, tolerances=CONTENT["tolerances"][:1], **extra))

@@ -246,7 +246,7 @@ def test_other_screens_are_not_shared():
     np.testing.assert_array_equal(sent.screens("low"), screens)
 
 
-@pytest.mark.parametrize("radius", [4.0, 45.0])
+@pytest.mark.parametrize("radius", [4.0, pytest.param(45.0, marks=pytest.mark.slow)])
 def test_rows_under_the_light_of_stars(radius):
     """Brute force: every star, every time step, points around the rim of the pupil."""
     air = small_atmosphere(time_step=0.1)

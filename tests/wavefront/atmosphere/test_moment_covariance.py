@@ -122,7 +122,9 @@ def test_wick_against_monte_carlo():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("lag", [(0.0, 0.0), (30 * ARCSEC, 0.0), (-20 * ARCSEC, 40 * ARCSEC)])
+@pytest.mark.parametrize(
+    "lag", [(0.0, 0.0), pytest.param((30 * ARCSEC, 0.0), marks=pytest.mark.slow), (-20 * ARCSEC, 40 * ARCSEC)]
+)
 def test_against_sums_over_a_small_pupil(lag):
     """The mean over pupil and delays is a double sum over all points and moments of the exposure.
 

@@ -111,7 +111,7 @@ def test_rest_structure_function_starts_as_that_of_the_high_modes_and_never_fall
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_rays_through_the_layers_against_plain_numpy(polynomial_pupil, seed):
     """The image as a plain sum over rays and frequencies: exp(-i k x) of every ray, times the filter."""
     jacobian = np.array([[10.3, 0.2], [-0.1, 10.5]])
