@@ -124,7 +124,7 @@ def test_whiskers_are_the_moments_of_the_stars_on_their_ccds():
     moments = pachon.psf_moments(
         scene.telescope,
         star_fields,
-        624e-9,
+        scene.wavelength,
         focal_plane=scene.focal_plane,
         atmosphere=scene.atmosphere,
         stamps=Stamps.of_camera("lsst", size=27),

@@ -221,7 +221,7 @@ def test_light_beyond_the_grids_is_below_the_noise_of_the_deep_cutout(small_run)
     """A spheroid of 22 mag: its grid is chosen for one exposure, but in the middle for all of those of the cutout."""
 
     def spheroids(xi, eta):
-        middle, corner = (np.mean(xi), np.mean(eta)), (np.mean(xi) + 100.0 * ARCSEC, np.mean(eta))
+        middle, corner = (np.mean(xi), np.mean(eta)), (np.mean(xi) + 120.0 * ARCSEC, np.mean(eta))
         return Galaxies.single(*np.transpose([middle, corner]), [22.0, 22.0], [0.8 * ARCSEC] * 2, sersic=4.0)
 
     one = Exposure("r", 15.0)
@@ -235,9 +235,9 @@ def test_light_beyond_the_grids_is_below_the_noise_of_the_deep_cutout(small_run)
     inside = np.zeros(window.shape, dtype=bool)
     inside[cutout.y - window.y :, cutout.x - window.x :][: cutout.height, : cutout.width] = True
     assert cutout.width < 600
-    # Elsewhere the edge of a grid is a twentieth of the noise of the deep image and more.
+    # Elsewhere the edge of a grid is a twentieth of the noise of the deep image and more; bright stars are rounded.
     assert lost[inside].max() < 0.01
-    assert lost.max() > 0.03
+    assert (lost - 4.0 * np.spacing(wide) / deep.noise_rms).max() > 0.03
 
 
 def test_whole_galaxies_have_the_moments_of_their_components():
