@@ -39,6 +39,7 @@ def simulate_ccds(
     centered: bool = False,
     title: str | None = None,
     strict: bool = True,
+    together: int | None = None,
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> SimulatedCcds[_T]:
@@ -48,8 +49,9 @@ def simulate_ccds(
     order, with the error of a CCD in its place, and none may depend on the other CCDs. It runs on a thread of its own,
     once at a time, in the order of the CCDs; no byte depends on the number of threads. `names` are by default those of
     the configuration, `fields` are the stars of each CCD, by default drawn over it, and `title` is that of the progress
-    bar. With `centered` exposures hold the observed stars centred on a pixel as well. A CCD that cannot be modelled
-    ends the loop with `strict`, after the models under way; otherwise it is reported and left out.
+    bar. CCDs that are exposed together have `together` stars, by default as many as a run may lose when it is stopped.
+    With `centered` exposures hold the observed stars centred on a pixel as well. A CCD that cannot be modelled ends the
+    loop with `strict`, after the models under way; otherwise it is reported and left out.
 
     Raises
     ------
@@ -94,7 +96,7 @@ def simulate_ccds(
                     reporter.line(left_out_line(ccd, result.reason))
             pending.clear()
 
-        exposed_ccds, groups = 0, _groups(experiment, names, fields)
+        exposed_ccds, groups = 0, _groups(experiment, names, fields, together or _STARS_TOGETHER)
         for exposures in _exposures(experiment, groups, centered=centered, threads=threads, progress=stage.advance):
             collect()
             submit(exposures)
@@ -121,13 +123,13 @@ def one_by_one(reduce: Callable[..., _T], *columns: Sequence[Any]) -> list[_T | 
 
 
 def _groups(
-    experiment: Experiment, names: Sequence[str], fields: Mapping[str, StarField] | None
+    experiment: Experiment, names: Sequence[str], fields: Mapping[str, StarField] | None, most: int
 ) -> Iterator[dict[str, StarField]]:
-    """Yield the stars of CCDs that are exposed together, by name, as many CCDs as have :data:`_STARS_TOGETHER`."""
+    """Yield the stars of CCDs that are exposed together, by name: as many CCDs as have so many stars at most."""
     group: dict[str, StarField] = {}
     for name in names:
         stars = ccd_stars(experiment, name, PROVISIONAL_FWHM) if fields is None else fields[name]
-        if group and sum(map(_star_count, group.values())) + _star_count(stars) > _STARS_TOGETHER:
+        if group and sum(map(_star_count, group.values())) + _star_count(stars) > most:
             yield group
             group = {}
         group[name] = stars

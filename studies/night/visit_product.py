@@ -40,6 +40,8 @@ PIXEL_COLUMNS = {
     "AREA": ("pixel2", "effective area of the PSF"),
 }
 _ROW_COLUMNS = tuple(name for name in rows.COLUMNS if name not in ("visitId", "band"))
+#: Stars of the CCDs that are exposed and modelled together: a visit is computed whole or not at all.
+_STARS_TOGETHER = 3000
 
 
 @dataclass(frozen=True)
@@ -156,6 +158,7 @@ class VisitWork:
                 fields={name: _fields(experiment, name, self.config.models) for name in names},
                 title=f"{visit.label}, {visit.band}: {len(names)} CCDs",
                 strict=False,
+                together=_STARS_TOGETHER,
                 threads=threads,
                 reporter=reporter,
             )
