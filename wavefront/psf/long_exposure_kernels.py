@@ -244,8 +244,11 @@ def transform_pupils(
                 if point < inner_end or point >= outer_start:
                     scale = wp.float32(1.0)
                 sample = depth * n_point + point
-                lay_waves(x, scale, fade_x[light_channel], sample, n_sample, n_packet, along_x[star])
-                lay_waves(y, wp.float32(1.0), fade_y[light_channel], sample, n_sample, n_packet, along_y[star])
+                cosine, sine = unit_circle(-x * lane_numbers(0))
+                lay_waves(cosine, sine, scale, fade_x[light_channel], sample, n_sample, n_packet, along_x[star])
+                cosine, sine = unit_circle(-y * lane_numbers(0))
+                full = wp.float32(1.0)
+                lay_waves(cosine, sine, full, fade_y[light_channel], sample, n_sample, n_packet, along_y[star])
         for rim in range(2 * n_spoke):
             point = rim
             if rim >= n_spoke:

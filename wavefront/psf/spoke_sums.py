@@ -20,24 +20,10 @@ RIM_NUMBERS = 5
 # Lanes of rims whose sums, which are more than those of other points, stay in registers together.
 _RIM_LANES = LANES // 2
 
-# Taylor series over an eighth of a turn to either side of the nearest quarter, as in :func:`.unit_circle`.
 _WAVES_ALONG = f"""
     typedef float packet __attribute__((vector_size({4 * LANES}), aligned(4)));
-    typedef int integers __attribute__((vector_size({4 * LANES}), aligned(4)));
-    const packet number = {{{", ".join(f"{i}.0f" for i in range(LANES))}}};
-    const packet quarters = -4.0f * turn * number;
-    const packet nearest = __builtin_elementwise_floor(quarters + 0.5f);
-    const packet angle = (quarters - nearest) * 1.57079632679f;
-    const packet s = angle * angle;
-    const packet near_sine = angle * (1.0f + s * (-1.0f / 6.0f + s * (1.0f / 120.0f + s * (-1.0f / 5040.0f
-        + s * (1.0f / 362880.0f)))));
-    const packet near_cosine = 1.0f + s * (-0.5f + s * (1.0f / 24.0f + s * (-1.0f / 720.0f + s * (1.0f / 40320.0f))));
-    const integers quadrant = __builtin_convertvector(nearest, integers) & 3;
-    const integers odd = (quadrant & 1) == 1;
-    const packet c = odd ? near_sine : near_cosine;
-    const packet d = odd ? near_cosine : near_sine;
-    packet cosine = ((quadrant + 1) & 2) ? -c : c;
-    packet sine = (quadrant & 2) ? -d : d;
+    packet cosine = *(const packet*)&first_cosine;
+    packet sine = *(const packet*)&first_sine;
     // Each packet is the one before, turned by as many numbers as it has.
     const float turned_cosine = cosine[{LANES - 1}] * cosine[1] - sine[{LANES - 1}] * sine[1];
     const float turned_sine = sine[{LANES - 1}] * cosine[1] + cosine[{LANES - 1}] * sine[1];
@@ -54,12 +40,16 @@ _WAVES_ALONG = f"""
         out += 2 * {LANES} * n_sample;
     }}
 """
-# Cosine and sine along x (a, b) and y (c, d) of a point.
-_WAVES = f"""
+# Sums of products of cosines and sines along x (a, b) and y (c, d) of a point.
+_ADD_WAVES = f"""
                 const packet a = *(const packet*)(x + 2 * {LANES} * point);
                 const packet b = *(const packet*)(x + 2 * {LANES} * point + {LANES});
                 const float c = y[2 * {LANES} * point];
                 const float d = y[2 * {LANES} * point + {LANES}];
+                cc = cc + c * a;
+                ss = ss + d * b;
+                cs = cs + d * a;
+                sc = sc + c * b;
 """
 _INNER_LOOP = f"""
     #pragma clang fp contract(fast)
@@ -69,11 +59,7 @@ _INNER_LOOP = f"""
     packet cc = {{}}, ss = {{}}, cs = {{}}, sc = {{}};
     for (int depth = 0; depth < n_depth; ++depth)
         for (int point = depth * n_point + n_spoke; point < (depth + 1) * n_point - n_spoke; ++point) {{
-            {_WAVES}
-            cc = cc + c * a;
-            ss = ss + d * b;
-            cs = cs + d * a;
-            sc = sc + c * b;
+            {_ADD_WAVES}
         }}
     // At -row the sine along y has the other sign.
     packet* sum = (packet*)sums.data;
@@ -105,18 +91,11 @@ _RIM_LOOP = f"""
                 x += 2 * {LANES} * (n_point - 2 * n_spoke);
                 y += 2 * {LANES} * (n_point - 2 * n_spoke);
             }}
-            packet cc = y[0] * *(const packet*)x;
-            packet ss = y[{LANES}] * *(const packet*)(x + {LANES});
-            packet cs = y[{LANES}] * *(const packet*)x;
-            packet sc = y[0] * *(const packet*)(x + {LANES});
+            packet cc = {{}}, ss = {{}}, cs = {{}}, sc = {{}};
             #pragma clang loop unroll(disable)
-            for (int depth = 1; depth < n_depth; ++depth) {{
+            for (int depth = 0; depth < n_depth; ++depth) {{
                 const int point = depth * n_point;
-                {_WAVES}
-                cc = cc + c * a;
-                ss = ss + d * b;
-                cs = cs + d * a;
-                sc = sc + c * b;
+                {_ADD_WAVES}
             }}
             x += 2 * {LANES};
             y += 2 * {LANES};
@@ -159,7 +138,8 @@ _RIM_LOOP = f"""
 
 @wp.func_native(_WAVES_ALONG)
 def lay_waves(
-    turn: wp.float32,
+    first_cosine: samples,
+    first_sine: samples,
     scale: wp.float32,
     fade: wp.array(dtype=samples),
     sample: wp.int32,
@@ -167,9 +147,10 @@ def lay_waves(
     n_packet: wp.int32,
     along: wp.array3d(dtype=samples),
 ):
-    """Lay the wave of one point along an axis: cosines and sines of minus its frequencies times a turn, to 1e-7.
+    """Lay the wave of one point along an axis, for all packets of frequencies by that of the first one, to 1e-7.
 
-    Arguments: scale and fade [packet], filters of the frequencies; along [packet, n_sample, 2]: results at a sample.
+    Arguments: cosines and sines of the first packet, whose first number is zero; scale and fade [packet], filters of
+    the frequencies; along [packet, n_sample, 2]: results at a sample.
     """
     ...
 
