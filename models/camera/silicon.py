@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
+from ...core.gauss_rule import gauss_rule
 from ...core.units import length, one_number
 from ..media.silicon import absorption_length, check_temperature, silicon_index
 
@@ -102,22 +103,12 @@ class Silicon:
 @functools.lru_cache(maxsize=256)
 def _gauss_rule(silicon: Silicon, wavelength: float, count: int) -> ConversionPaths:
     """Return the rule of :meth:`Silicon.paths`; maps of many fields ask for the same one again and again."""
-    from scipy.linalg import eigh_tridiagonal
-
     length = silicon.absorption_length(wavelength)
     path = 0.5 * min(silicon.thickness / length, _ALL_ABSORBED) * (_NODE + 1.0)
     density = _WEIGHT * np.exp(-path)
     density /= density.sum()
-    # Recurrence of the orthonormal polynomials of the distribution, by Stieltjes' procedure.
-    diagonal, beside = np.empty(count), np.zeros(count)
-    previous, current = np.zeros_like(path), np.ones_like(path)
-    for k in range(count):
-        diagonal[k] = density @ (path * current**2)
-        following = (path - diagonal[k]) * current - beside[k - 1] * previous
-        beside[k] = math.sqrt(density @ following**2)
-        previous, current = current, following / beside[k]
-    roots, vectors = eigh_tridiagonal(diagonal, beside[: count - 1])
-    rule = ConversionPaths(length * roots, silicon.absorbed(wavelength) * vectors[0] ** 2)
+    roots, parts = gauss_rule(path, density, count)
+    rule = ConversionPaths(length * roots, silicon.absorbed(wavelength) * parts)
     # Shared by all callers.
     rule.length.flags.writeable = rule.weight.flags.writeable = False
     return rule

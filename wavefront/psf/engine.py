@@ -47,6 +47,7 @@ class PsfInputs:
     projection: Projection = "zemax"
     threads: int | None = None
     trace: Callable[..., PupilOptics] = trace_pupils
+    has_spectra: bool = False  #: whether stars have photons of their own at each wavelength
 
 
 @dataclass(frozen=True)

@@ -202,6 +202,7 @@ def psf_inputs(
         silicon=stamps.silicon,
         projection=projection,
         threads=threads,
+        has_spectra=photons is not None,
     )
     return inputs, Stars(angles, places, photons)
 

@@ -239,7 +239,9 @@ class _Moments(LongExposureRenderer):
         # No light falls beside a stamp.
         self._inputs = replace(self._inputs, plane=replace(self._inputs.plane, size=_WIDE_STAMP))
 
-    expose = LongExposureRenderer._expose
+    def expose(self, stars: Stars) -> ExposedStars:
+        """Expose stars: their moments in place of stamps."""
+        return self._expose(stars)
 
     @property
     def _weight(self) -> float:

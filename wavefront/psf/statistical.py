@@ -40,6 +40,7 @@ from .field_optics import FieldOptics, field_optics
 from .image_plane import square_transfer
 from .long_exposure import LongExposureEngine, LongExposureRenderer
 from .sample_packets import samples
+from .spectral_rule import spectral_rule
 from .statistical_kernels import blur_spectra
 
 #: FWHM of the weight under which moments of the fourth order have the same effect as the kernel [rad].
@@ -120,8 +121,10 @@ class StatisticalRenderer(LongExposureRenderer):
         telescope = inputs.telescope
         self._base = inputs.aberration
         self._exposed_air = ExposedAir.of(air, telescope.pupil_diameter, telescope.pupil_obscuration)
-        super().__init__(inputs, options)
-        self._inputs = replace(inputs, aberration=_WithAir.of(self._base, self._exposed_air, self.drawn))
+        self._rule = None if inputs.has_spectra else spectral_rule(inputs, self.depths)
+        super().__init__(inputs if self._rule is None else self._rule.inputs(inputs), options)
+        with_air = _WithAir.of(self._base, self._exposed_air, self.drawn)
+        self._inputs, self._wave_count = replace(self._inputs, aberration=with_air), len(inputs.wavelengths)
 
     @cached_property
     def drawn(self) -> ExposureFields:
@@ -142,7 +145,9 @@ class StatisticalRenderer(LongExposureRenderer):
         on_detector = k / self.focal_length
         pixel = square_transfer(on_detector, 0.0 * k, self._plane.pixel_size)
         spread = np.exp(-0.5 * (self._plane.diffusion**2 + self._plane.jitter**2) * on_detector**2)
-        return MomentResponse.of(k, (air * diffraction).mean(axis=0) * pixel * spread, weight)
+        photons = None if self._rule is None else self._rule.photons
+        mean = np.average(air * diffraction, axis=0, weights=photons)
+        return MomentResponse.of(k, mean * pixel * spread, weight)
 
     def kernels(self, optics: PupilOptics) -> np.ndarray:
         """Return the Gaussian kernels of stars on the sky, xx, yy, xy [rad^2], [n_star, 3]."""
@@ -157,6 +162,15 @@ class StatisticalRenderer(LongExposureRenderer):
     def _mean_moments(self) -> np.ndarray:
         """Moments xx, yy, xy of the slopes of two Zernikes of the mean wavefront [1/m^2], [3, n_noll, n_noll]."""
         return _gradient_moments(self._diameter, self._obscuration)
+
+    def _expose(self, stars: Stars) -> ExposedStars:
+        if self._rule is None:
+            return super()._expose(stars)
+        photons = np.broadcast_to(self._rule.photons, (len(stars), len(self._rule.photons)))
+        exposed = super()._expose(replace(stars, photons=photons))
+        # Apertures cut all wavelengths alike.
+        lit = np.repeat(exposed.lit_fraction[:, :1], self._wave_count, axis=1)
+        return exposed._replace(lit_fraction=lit)
 
     def _exposed_spectra(self, spectrum: np.ndarray, optics: PupilOptics) -> np.ndarray:
         xx, yy, xy = self.kernels(optics).T
