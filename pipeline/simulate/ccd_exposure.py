@@ -284,6 +284,7 @@ def _expose(
             experiment.silicon,
             offsets,
             recenter,
+            room,
         ),
         engine=psf_engine(config.psf.engine).with_n_pupil(config.psf.n_pupil),
         threads=threads,

@@ -24,9 +24,11 @@ class ImagePlane:
     pixel_size: float  #: side of a square pixel [m]
     diffusion: float  #: rms along each axis of the charge diffusion [m]
     jitter: float = 0.0  #: rms along each axis of how far the telescope's pointing moves images during an exposure [m]
+    room: int = 0  #: pixels of a side that will be cut off
 
     def __post_init__(self) -> None:
         require_count(self.size, "size", 3, 4096)
+        require_count(self.room, "room", 0, self.size - 1)
         if not (math.isfinite(self.pixel_size) and self.pixel_size > 0.0):
             raise DomainError(f"pixel_size = {self.pixel_size!r}: expected a positive length in metres")
         for name, rms in (("diffusion", self.diffusion), ("jitter", self.jitter)):

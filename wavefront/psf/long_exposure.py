@@ -158,7 +158,8 @@ class LongExposureRenderer(PsfRenderer):
 
     def _period(self) -> float:
         """Return the side of the periodic image [m]."""
-        return GRID_MARGIN * self._plane.side
+        plane = self._plane
+        return max(GRID_MARGIN * (plane.size - plane.room), plane.size) * plane.pixel_size
 
     def _turbulence(self, baseline: np.ndarray) -> np.ndarray:
         """Return the mean transfer function of the atmosphere at baselines [m], shape [n_wave, n]."""

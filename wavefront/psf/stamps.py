@@ -48,6 +48,9 @@ class Stamps:
         Centroids of stamps: given images [n, ny, nx] and the angle of a pixel [rad], it returns places (x, y) from the
         centre of the middle pixel [pixels], shape [n, 2]. Each star is then drawn once more, with its centroid at the
         centre. That is exact, unlike a shift of the pixels, and costs little.
+    room : int
+        Pixels of a side that will be cut off, around the middle ones: long exposures and the statistical engine let
+        wings that wrap around fall there, which makes them quicker.
 
     Raises
     ------
@@ -62,6 +65,7 @@ class Stamps:
     silicon: Silicon | None = None
     offsets: ArrayLike | None = None
     recenter: Callable[[np.ndarray, float], np.ndarray] | None = None
+    room: int = 0
 
     @classmethod
     def of_camera(
@@ -86,4 +90,4 @@ class Stamps:
 
     def image_plane(self, focal_length: float) -> ImagePlane:
         """Return the detector behind a telescope of a focal length [m], which turns jitter into motion on it."""
-        return ImagePlane(self.size, self.pixel_size, self.diffusion, self.jitter * focal_length)
+        return ImagePlane(self.size, self.pixel_size, self.diffusion, self.jitter * focal_length, self.room)

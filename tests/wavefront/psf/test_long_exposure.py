@@ -161,6 +161,15 @@ def test_perfect_optics_give_the_long_exposure_in_closed_form(polynomial_pupil):
     np.testing.assert_allclose(image, theory(plane, shift=shift, margin=4.0), atol=4e-4 * expected.max())
 
 
+def test_wings_come_round_where_pixels_are_cut_off(polynomial_pupil):
+    """61 pixels of which 47 stay: the image comes round after them all, not after 1.25 times as many."""
+    plane = ImagePlane(61, 5e-6, 1e-6, room=14)
+    image = renderer_for(polynomial_pupil(), plane=plane).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
+    expected = theory(plane, margin=1.0)
+    np.testing.assert_allclose(image, expected, atol=5e-5 * expected.max())
+    assert np.abs(image - theory(plane))[0].max() > 1e-4 * expected.max()
+
+
 def test_width_of_perfect_optics(polynomial_pupil):
     plane = ImagePlane(121, 2.5e-6, 0.0)
     image = renderer_for(polynomial_pupil(), plane=plane).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
