@@ -167,7 +167,9 @@ def test_wings_come_round_where_pixels_are_cut_off(polynomial_pupil):
     image = renderer_for(polynomial_pupil(), plane=plane).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
     expected = theory(plane, margin=1.0)
     np.testing.assert_allclose(image, expected, atol=5e-5 * expected.max())
-    assert np.abs(image - theory(plane))[0].max() > 1e-4 * expected.max()
+    # A third of the light at the rim is theirs.
+    assert image[0].mean() == pytest.approx(expected[0].mean(), rel=0.05)
+    assert image[0].mean() > 1.3 * theory(plane)[0].mean()
 
 
 def test_width_of_perfect_optics(polynomial_pupil):
