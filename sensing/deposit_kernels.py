@@ -44,7 +44,6 @@ _ADD = f"""
                 if (n_column == 1) continue;
                 out[1] += left;
                 out[2] += down;
-                if (growth) out[growth] += 0.5f * weight * (y[0] * x[2 * in_x] + y[2 * in_y] * x[0]);
                 out += head;
                 const float scaled_left = scale * left, scaled_down = scale * down;
                 int k = 0;
@@ -73,7 +72,6 @@ def add_points(
     rates: wp.array2d(dtype=wp.float32),
     scale: wp.float32,
     head: wp.int32,
-    growth: wp.int32,
     cells: wp.array2d(dtype=wp.float32),
 ):
     """Add all points of a star to the cells of its grid, from contiguous arrays."""
@@ -94,7 +92,6 @@ def deposit_points(
     rates: wp.array2d(dtype=wp.float32),
     scale: wp.float32,
     head: wp.int32,
-    growth: wp.int32,
     cells: wp.array2d(dtype=wp.float32),
 ):
     """Add the points of one star, the only item, to the cells of its grid.
@@ -102,8 +99,8 @@ def deposit_points(
     Arguments: x_taps, y_taps [4, tap, point]: kernels and their first three derivatives; columns, rows [tap, point],
     negative beside the grid; width of the grid [cell]; spread [3, point]: halves of the second moments xx and yy, and
     xy between them; weights [point]; response [2, point, k] in units of the inverse scale [cell]; rates [point, j].
-    Result [cell, column]: the light, then by x and y; from column head on by the response and by the rates; in column
-    growth, unless 0, half the Laplacian of the kernels. With a single column there is the light alone.
+    Result [cell, column]: the light, then by x and y; from column head on by the response and by the rates. With a
+    single column there is the light alone.
     """
     if first + wp.tid() == 0:
-        add_points(x_taps, y_taps, columns, rows, width, spread, weights, response, rates, scale, head, growth, cells)
+        add_points(x_taps, y_taps, columns, rows, width, spread, weights, response, rates, scale, head, cells)

@@ -36,6 +36,9 @@ MOST_NEIGHBOURS = 5
 FLUX, X, Y, BACKGROUND, STRENGTH, SLOPE_X, SLOPE_Y, RATIO = range(8)
 #: Power of the strength of the turbulence that the exponent of its transfer function goes by.
 EXPONENT_GROWTH = 5.0 / 3.0
+#: Step of the difference that the core follows its variance by, over it, and the least one [pixels^2].
+_WIDER = 2e-2
+_LEAST_WIDER = 1e-3
 #: Exponent of the air at Nyquist's frequency beyond which an image has no core.
 _SMOOTH = 6.0
 #: Exponent of the air at Nyquist's frequency below which a Gaussian is all of it.
@@ -211,10 +214,11 @@ class ImageGrid:
         transfer = self._filter(strength)
         growth = -5.0 / 3.0 * self._exponent * strength ** (2.0 / 3.0) * transfer
         if self._has_core(strength):
-            edge = self._edge(strength)
-            core = self._detector * np.exp(-edge / 6.0 * (1.0 + 5.0 * self._square))
+            amplitude, fading = self._gaussian(strength)[0], self._gaussian_growth(strength)[0]
+            exponent = 5.0 / 6.0 * self._edge(strength) * self._square
+            core = self._detector * (amplitude * np.exp(-exponent))
             transfer = transfer - core
-            growth += edge * EXPONENT_GROWTH / max(strength, 1e-12) / 6.0 * (1.0 + 5.0 * self._square) * core
+            growth += (EXPONENT_GROWTH / max(strength, 1e-12) * exponent - fading) * core
         return transfer, growth
 
     def places(self, unknowns: np.ndarray, landing: np.ndarray) -> np.ndarray:
@@ -344,9 +348,12 @@ class ImageGrid:
             deposit = core.deposit(places, spread, variance)
             if response is None or rates is None:
                 return deposit.light(weights)
-            pixels = deposit.derivatives(weights, response, amplitude * rates, 1.0 / self.pixel, first, STRENGTH)
-            pixels[:, STRENGTH] *= np.float32(widening)
-            pixels[:, STRENGTH] += np.float32(fading) * pixels[:, FLUX]
+            pixels = deposit.derivatives(weights, response, amplitude * rates, 1.0 / self.pixel, first)
+            if strength > 0.0:
+                step = max(_WIDER * variance, _LEAST_WIDER)
+                wider = core.deposit(places, spread, variance + step).light(weights)[:, 0]
+                pixels[:, STRENGTH] = np.float32(widening / step) * (wider - pixels[:, FLUX])
+                pixels[:, STRENGTH] += np.float32(fading) * pixels[:, FLUX]
             return pixels
 
         stars = of_one_star(points)

@@ -170,10 +170,10 @@ class Deposit:
 
     def light(self, weights: np.ndarray) -> np.ndarray:
         """Return the light of weighted points [n] on the cells, shape [n_cell, 1]."""
-        return self._deposited(weights, np.zeros((2, self._count, 0)), np.zeros((self._count, 0)), 1.0, 1, 0)
+        return self._deposited(weights, np.zeros((2, self._count, 0)), np.zeros((self._count, 0)), 1.0, 1)
 
     def derivatives(
-        self, weights: np.ndarray, response: np.ndarray, rates: np.ndarray, scale: float, head: int = 3, growth: int = 0
+        self, weights: np.ndarray, response: np.ndarray, rates: np.ndarray, scale: float, head: int = 3
     ) -> np.ndarray:
         """Return the light of points on the cells and its derivatives.
 
@@ -189,22 +189,20 @@ class Deposit:
             Cells in a unit of the response.
         head : int
             Columns before those of the response.
-        growth : int
-            Column of the derivative by the variance of a further blur; 0 for none.
 
         Returns
         -------
         ndarray of float32, shape [n_cell, head + k + j]
             The light, its derivatives along x and y, further columns, and the derivatives by the unknowns.
         """
-        return self._deposited(weights, response, rates, scale, head, growth)
+        return self._deposited(weights, response, rates, scale, head)
 
     def _deposited(
-        self, weights: np.ndarray, response: np.ndarray, rates: np.ndarray, scale: float, head: int, growth: int
+        self, weights: np.ndarray, response: np.ndarray, rates: np.ndarray, scale: float, head: int
     ) -> np.ndarray:
         columns = head + response.shape[2] + rates.shape[1]
         cells = np.zeros((self._size[0] * self._size[1], columns), dtype=np.float32)
         values = (warp_array(v, wp.float32) for v in (weights, response, rates))
-        arguments = [*self._arguments, *values, scale, head, growth, warp_array(cells, wp.float32)]
+        arguments = [*self._arguments, *values, scale, head, warp_array(cells, wp.float32)]
         launch(deposit_points, 1, arguments, threads=1)
         return cells

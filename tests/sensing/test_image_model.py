@@ -183,7 +183,7 @@ def test_deposits_are_sums_over_points():
     spread = 0.02 * rng.normal(size=(count, 2, 2))
     spread[:, 1, 0] = spread[:, 0, 1]
     weights, response, rates = rng.random(count), rng.normal(size=(2, count, 11)), rng.normal(size=(count, 3))
-    scale, head, growth = 2.5, 7, 4
+    scale, head = 2.5, 7
     kernel = PixelKernel(0.7, 1.0, 0.4)
     expected = np.zeros((ny + 2 * pad, nx + 2 * pad, head + 14))
     for (px, py), moments, w, r, rate in zip(places, spread, weights, response.swapaxes(0, 1), rates, strict=True):
@@ -197,14 +197,13 @@ def test_deposits_are_sums_over_points():
         row, column = pad + first_y[0], pad + first_x[0]
         out = expected[row : row + len(y[0]), column : column + len(x[0])]
         out[..., :3] += w * np.concatenate([image(0, 0), image(1, 0), image(0, 1)], axis=-1)
-        out[..., growth] += 0.5 * w * (np.outer(y[0], x[2]) + np.outer(y[2], x[0]))
         out[..., head : head + 11] += scale * w * (image(1, 0) * r[0] + image(0, 1) * r[1])
         out[..., head + 11 :] += image(0, 0) * rate
     far = np.array([[500.0, 0.0], [-1e7, 3.0]])
     places, spread, weights, rates = (np.concatenate([v, v[:2]]) for v in (places, spread, weights, rates))
     places[count:], response = far, np.concatenate([response, response[:, :2]], axis=1)
     core = SharpCore((ny, nx), 1.0, 0.4, np.diag([0.7, 0.7]))
-    columns = core.deposit(places, spread, 0.0).derivatives(weights, response, rates, scale, head, growth)
+    columns = core.deposit(places, spread, 0.0).derivatives(weights, response, rates, scale, head)
     expected = expected[pad:-pad, pad:-pad]
     # Single precision.
     np.testing.assert_allclose(columns.reshape(expected.shape), expected, atol=2e-6 * np.abs(expected).max())
