@@ -183,14 +183,15 @@ def radial_series(m: int, count: int, obscuration: float = 0.0) -> np.ndarray:
 
 def zernike_monomials(jmax: int, obscuration: float = 0.0) -> np.ndarray:
     """Return Zernikes 1 ... jmax as polynomials, element [j - 1, p, q] the coefficient of x^p y^q."""
-    degree = noll_to_nm(jmax)[0]
+    orders = [noll_to_nm(j) for j in range(1, jmax + 1)]
+    degree = orders[-1][0]
     out = np.zeros((jmax, degree + 1, degree + 1))
-    for row in range(jmax):
-        n, signed = noll_to_nm(row + 1)
+    radial = {m: radial_series(m, top + 1, obscuration) for m, top in _radial_degrees(orders).items()}
+    for row, (n, signed) in enumerate(orders):
         m = abs(signed)
         i = (n - m) // 2
         scale = np.sqrt(2.0) if m else 1.0
-        for k, coefficient in enumerate(radial_series(m, i + 1, obscuration)[:, i]):
+        for k, coefficient in enumerate(radial[m][: i + 1, i]):
             # (x^2 + y^2)^k times the real or imaginary part of (x + iy)^m
             for a in range(k + 1):
                 for b in range(m + 1):

@@ -17,7 +17,7 @@ from scipy.special import jv
 from ..models.zernike_polynomials import annular_zernikes, noll_to_nm
 
 #: Points of the radius and of the spatial frequency in the integrals.
-_RADII = 160
+_RADII = 40
 _FREQUENCIES = 240
 #: Largest frequency [rad per radius of the pupil]: terms of the eleventh degree have their power below 20.
 _HIGHEST = 60.0
@@ -38,18 +38,15 @@ def air_shape(last: int, obscuration: float, outer_scale: float) -> np.ndarray:
     outer_scale : float
         Outer scale over the radius of the pupil; may be infinite.
     """
-    noll = np.arange(4, last + 1)
-    degrees = [noll_to_nm(int(j)) for j in noll]
-    edges = np.linspace(obscuration, 1.0, _RADII + 1)
-    radii = 0.5 * (edges[1:] + edges[:-1])
+    degrees = [noll_to_nm(j) for j in range(4, last + 1)]
+    nodes, weights = np.polynomial.legendre.leggauss(_RADII)
+    radii = 0.5 * (1.0 + obscuration + (1.0 - obscuration) * nodes)
     frequencies = np.geomspace(_LOWEST, _HIGHEST, _FREQUENCIES)
     bessel = {m: jv(m, np.outer(frequencies, radii)) for m in {abs(m) for _, m in degrees}}
-    transforms = np.zeros((len(noll), _FREQUENCIES))
-    for k, (j, (_, m)) in enumerate(zip(noll, degrees, strict=True)):
-        # Along the direction in which a term of the cosine, or of the sine, is largest.
-        angle = 0.5 * np.pi / abs(m) if m < 0 else 0.0
-        profile = annular_zernikes(int(j), radii * np.cos(angle), radii * np.sin(angle), obscuration)[j - 1]
-        transforms[k] = bessel[abs(m)] @ (profile * radii)
+    # Terms of the sine have the radial profile of those of the cosine, one of which may come after the last term.
+    values = annular_zernikes(last + 1, radii, np.zeros_like(radii), obscuration)
+    profiles = {noll_to_nm(j): values[j - 1] for j in range(4, last + 2)}
+    transforms = np.array([bessel[abs(m)] @ (profiles[n, abs(m)] * radii * weights) for n, m in degrees])
     # An interval of the logarithm of the frequency has kappa^2 d(ln kappa), of which the exposure leaves one power.
     power = frequencies * (frequencies**2 + (2.0 * np.pi / outer_scale) ** 2) ** (-11.0 / 6.0)
     covariance = (transforms * power) @ transforms.T

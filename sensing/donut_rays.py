@@ -10,6 +10,7 @@ are exact for a wavefront of any size. Where rays are aimed, Zernikes are functi
 from __future__ import annotations
 
 from copy import copy
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -63,6 +64,24 @@ class LightRays(Protocol):
         """Free what can be computed again."""
 
 
+@dataclass
+class _LastLight:
+    """Light of a wavefront: coefficients [m], landing points [m], spread of its image once that was computed.
+
+    It `follows` other light by its response, unless its own rays were traced.
+    """
+
+    coefficients: np.ndarray
+    landing: np.ndarray
+    spread: np.ndarray | None = None
+    follows: _LastLight | None = None
+
+    @property
+    def traced(self) -> _LastLight:
+        """The light that was traced."""
+        return self.follows or self
+
+
 class ZernikeRays:
     """Landing points for a wavefront of annular Zernikes [m].
 
@@ -108,11 +127,8 @@ class ZernikeRays:
 
     def _begin(self, straight: dict[float, np.ndarray]) -> None:
         """Begin with landing points without a wavefront beside the telescope's, where they are at hand."""
-        #: Coefficients and landing points of the last light, with those that it follows, and of the last light that was
-        #: traced; landing points and spread of the last light of which it was computed.
-        self._last: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-        self._traced: tuple[np.ndarray, np.ndarray] | None = None
-        self._spread: tuple[np.ndarray, np.ndarray] | None = None
+        #: Several images of one wavefront follow each other, and others near it.
+        self._last: _LastLight | None = None
         self._straight = straight
         self._merged: ZernikeRays | None = None
         #: Sides of the image of a cell [m], columns of a matrix.
@@ -225,32 +241,33 @@ class ZernikeRays:
     def landing(self, unknowns: np.ndarray) -> np.ndarray:
         """Return landing points for coefficients [m]; see :class:`LightRays`."""
         coefficients = unknowns[: len(self._gradients)]
-        # Several images of one wavefront follow each other.
-        if self._last is None or not np.array_equal(self._last[0], coefficients):
-            self._last = (coefficients.copy(), *self._landing_near(coefficients))
-        return self._last[1]
+        if self._last is None or not np.array_equal(self._last.coefficients, coefficients):
+            self._last = self._light_of(coefficients.copy())
+        return self._last.landing
 
-    def _landing_near(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return landing points, and those of the light that they follow by its response, or they themselves."""
+    def _light_of(self, coefficients: np.ndarray) -> _LastLight:
+        """Return light of some coefficients [m], which follows the last that was traced where it is near that."""
         if not coefficients.any():
-            straight = np.concatenate([self._unaberrated(float(w)) for w in self._wavelengths]) - self._chief
-            return straight, straight
-        if self._traced is not None:
-            moved = (self._moving @ (coefficients - self._traced[0]).astype(np.float32)).T
+            straight = np.concatenate([self._unaberrated(float(w)) for w in self._wavelengths])
+            return _LastLight(coefficients, straight - self._chief)
+        if self._last is not None:
+            traced = self._last.traced
+            moved = (self._moving @ (coefficients - traced.coefficients).astype(np.float32)).T
             limit = _FOLLOWED**2 * abs(float(np.linalg.det(self.footprint)))
             if float(np.abs(self._weights) @ (moved**2).sum(axis=1)) < limit:
-                return self._traced[1] + moved, self._traced[1]
+                return _LastLight(coefficients, traced.landing + moved, follows=traced)
         slopes = -np.tensordot(coefficients, self._gradients, axes=1).T[None]
-        landing = np.concatenate([self._landing(float(w), slopes)[0] for w in self._wavelengths]) - self._chief
-        self._traced = (coefficients.copy(), landing)
-        return landing, landing
+        landing = np.concatenate([self._landing(float(w), slopes)[0] for w in self._wavelengths])
+        return _LastLight(coefficients, landing - self._chief)
 
     def spread(self, landing: np.ndarray) -> np.ndarray:
         """Return the spread of the image of each point; see :class:`LightRays`."""
-        traced = self._last[2] if self._last is not None and landing is self._last[1] else landing
-        if self._spread is None or self._spread[0] is not traced:
-            self._spread = (traced, spread_of(self.cells, traced, self.footprint))
-        return self._spread[1]
+        if self._last is None or landing is not self._last.landing:
+            return spread_of(self.cells, landing, self.footprint)
+        traced = self._last.traced
+        if traced.spread is None:
+            traced.spread = spread_of(self.cells, traced.landing, self.footprint)
+        return traced.spread
 
     def at_rims(self, rims: PupilRims, landing: np.ndarray, response: np.ndarray | None) -> RimsAt:
         """Return the rims on the detector; see :class:`LightRays`."""

@@ -35,13 +35,16 @@ NEIGHBOUR = ("ratio", "offset_x", "offset_y")
 MOST_NEIGHBOURS = 5
 FLUX, X, Y, BACKGROUND, STRENGTH, SLOPE_X, SLOPE_Y, RATIO = range(8)
 #: Power of the strength of the turbulence that the exponent of its transfer function goes by.
-_EXPONENT_GROWTH = 5.0 / 3.0
-#: Relative step of the difference that the core follows the strength of the turbulence by.
-_STRONGER = 1e-2
+EXPONENT_GROWTH = 5.0 / 3.0
+#: Step of the difference that the core follows its variance by, over it, and the least one [pixels^2].
+_WIDER = 2e-2
+_LEAST_WIDER = 1e-3
 #: Exponent of the air at Nyquist's frequency beyond which an image has no core.
 _SMOOTH = 6.0
 #: Exponent of the air at Nyquist's frequency below which a Gaussian is all of it.
 _NO_AIR = 6e-4
+#: The same below which air is no blur.
+_NO_BLUR = 1e-2
 #: The same below which that of the wavefront's derivatives is: 3 % of the light, wide and smooth, stays where it is.
 _THIN_AIR = 0.2
 
@@ -156,7 +159,7 @@ class ImageGrid:
         self._core: SharpCore | None = None
         if sharp:
             core = pixels.width / pixels.side, blur / pixel, footprint / pixel
-            self._core = SharpCore(shape, *core, _variance(_SMOOTH))
+            self._core = SharpCore(shape, *core)
 
     def diffracting(self, rims: PupilRims) -> ImageGrid:
         """Return the grid of a model of rays with diffraction at rims of the pupil."""
@@ -183,6 +186,10 @@ class ImageGrid:
         """Return the exponent of the air at Nyquist's frequency."""
         return float(self._edge_exponent * strength ** (5.0 / 3.0))
 
+    def unblurred(self, strength: float) -> bool:
+        """Return whether turbulence of a strength, or less of it, does not change the image."""
+        return self._edge(strength) < _NO_BLUR
+
     def _has_core(self, strength: float) -> bool:
         """Return whether some of the image is sharper than the grid."""
         return self._core is not None and self._edge(strength) < _SMOOTH
@@ -190,7 +197,13 @@ class ImageGrid:
     def _gaussian(self, strength: float) -> tuple[np.float32, float]:
         """Return the light of the core of the air's image, and its variance [pixels^2]."""
         edge = self._edge(strength)
-        return np.float32(math.exp(-edge / 6.0)), _variance(edge)
+        return np.float32(math.exp(-edge / 6.0) if edge > _NO_AIR else 1.0), _variance(edge)
+
+    def _gaussian_growth(self, strength: float) -> tuple[float, float]:
+        """Return the derivatives by the strength of the logarithm of the light of the core, and of its variance."""
+        edge = self._edge(strength)
+        growth = EXPONENT_GROWTH * edge / max(strength, 1e-12)
+        return -growth / 6.0 if edge > _NO_AIR else 0.0, _variance(growth)
 
     def _on_grid(self, strength: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the transfer function of what the grid holds, and its derivative by the strength of the turbulence.
@@ -201,10 +214,11 @@ class ImageGrid:
         transfer = self._filter(strength)
         growth = -5.0 / 3.0 * self._exponent * strength ** (2.0 / 3.0) * transfer
         if self._has_core(strength):
-            edge = self._edge(strength)
-            core = self._detector * np.exp(-edge / 6.0 * (1.0 + 5.0 * self._square))
+            amplitude, fading = self._gaussian(strength)[0], self._gaussian_growth(strength)[0]
+            exponent = 5.0 / 6.0 * self._edge(strength) * self._square
+            core = self._detector * (amplitude * np.exp(-exponent))
             transfer = transfer - core
-            growth += edge * _EXPONENT_GROWTH / max(strength, 1e-12) / 6.0 * (1.0 + 5.0 * self._square) * core
+            growth += (EXPONENT_GROWTH / max(strength, 1e-12) * exponent - fading) * core
         return transfer, growth
 
     def places(self, unknowns: np.ndarray, landing: np.ndarray) -> np.ndarray:
@@ -219,8 +233,8 @@ class ImageGrid:
             low = np.floor(place)
             t = (place - low).astype(np.float32)
             powers = np.stack([np.ones_like(t), t, t * t, t * t * t])
-            # The spline and its first three derivatives, shape [4, n]: long rows are quick.
-            taps.append([_SPLINES[k].T @ powers[: 4 - k] for k in range(4)])
+            # The spline and its first three derivatives.
+            taps.append(np.stack([_SPLINES[k].T @ powers[: 4 - k] for k in range(4)]))
             indices.append((low.astype(np.int32) + np.arange(-1, 3, dtype=np.int32)[:, None]) % self._size[1 - axis])
         return Deposit((taps[0], taps[1]), (indices[0], indices[1]), self._size, spread)
 
@@ -324,39 +338,34 @@ class ImageGrid:
         assert core is not None
         points, spread = self.places(unknowns, light.landing), light.spread / self.pixel**2
         amplitude, variance = self._gaussian(strength)
-        weights = amplitude * light.weights.astype(np.float32)[:, None]
+        fading, widening = self._gaussian_growth(strength)
+        weights = amplitude * light.weights.astype(np.float32)
 
-        def of_one_star(places: np.ndarray) -> list[np.ndarray]:
-            """Return the light of one star, then its derivatives by x, y, strength, wave and rims."""
+        first = len(unknowns)
+
+        def of_one_star(places: np.ndarray) -> np.ndarray:
+            """Return the light of one star and, with a response, its derivatives."""
             deposit = core.deposit(places, spread, variance)
-            splines = deposit.matrix(0, 0)
-            star = splines @ weights
             if response is None or rates is None:
-                return [star]
-            gradient = deposit.gradient(weights[:, 0])
-            along = gradient @ _both_axes(len(weights))
-            growth = np.zeros_like(star)
+                return deposit.light(weights)
+            pixels = deposit.derivatives(weights, response, amplitude * rates, 1.0 / self.pixel, first)
             if strength > 0.0:
-                stronger, wider = self._gaussian((1.0 + _STRONGER) * strength)
-                grown = core.deposit(places, spread, wider).matrix(0, 0) @ (stronger / amplitude * weights)
-                growth = (grown - star) / np.float32(_STRONGER * strength)
-            moved = response.astype(np.float32, copy=False).reshape(2 * len(weights), -1)
-            wave = gradient @ moved / np.float32(self.pixel)
-            return [star, along, growth, wave, splines @ (amplitude * rates).astype(np.float32)]
+                step = max(_WIDER * variance, _LEAST_WIDER)
+                wider = core.deposit(places, spread, variance + step).light(weights)[:, 0]
+                pixels[:, STRENGTH] = np.float32(widening / step) * (wider - pixels[:, FLUX])
+                pixels[:, STRENGTH] += np.float32(fading) * pixels[:, FLUX]
+            return pixels
 
         stars = of_one_star(points)
-        extra: list[np.ndarray] = []
-        for flux_ratio, *offset in neighbours_of(unknowns):
+        for k, (flux_ratio, *offset) in enumerate(neighbours_of(unknowns)):
             ratio = np.float32(flux_ratio)
             neighbour = of_one_star(points + np.array(offset) / self.scale)
+            stars += ratio * neighbour
             if response is not None:
-                extra += [neighbour[0], ratio / np.float32(self.scale) * neighbour[1]]
-            stars = [a + ratio * b for a, b in zip(stars, neighbour, strict=True)]
-        if response is None:
-            return core.pixels(stars[0])
-        star, along, growth, wave, shifts = stars
-        level, slopes = np.zeros_like(star), np.zeros_like(along)
-        return core.pixels(np.concatenate([star, along, level, growth, slopes, *extra, wave, shifts], axis=1))
+                column = RATIO + k * len(NEIGHBOUR)
+                stars[:, column] = neighbour[:, FLUX]
+                stars[:, column + 1 : column + 3] = ratio / np.float32(self.scale) * neighbour[:, [X, Y]]
+        return stars.reshape(*self.shape, -1)
 
     def _spectra(
         self,
@@ -366,15 +375,11 @@ class ImageGrid:
         rates: np.ndarray | None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return spectra of the star, its derivatives by place, wavefront and rims, and of those by all else."""
-        weights = light.weights.astype(np.float32)[:, None]
         splines = self._splines(self.places(unknowns, light.landing), light.spread / self.pixel**2)
         if response is None or rates is None:
-            deposits = splines.matrix(0, 0) @ weights
+            deposits = splines.light(light.weights)
         else:
-            moved = response.astype(np.float32, copy=False).reshape(2 * len(weights), -1) / np.float32(self.pixel)
-            along = splines.gradient(weights[:, 0]) @ np.concatenate([_both_axes(len(weights)), moved], axis=1)
-            lit = splines.matrix(0, 0) @ np.concatenate([weights, rates.astype(np.float32)], axis=1)
-            deposits = np.concatenate([lit[:, :1], along, lit[:, 1:]], axis=1)
+            deposits = splines.derivatives(light.weights, response, rates, 1.0 / self.pixel)
         spectra = fft.rfft2(deposits.reshape(*self._size, -1), axes=(0, 1))
         transfer, growth = (v.astype(np.float32)[..., None] for v in self._on_grid(float(unknowns[STRENGTH])))
         grown = growth * spectra[..., :1]
@@ -415,11 +420,6 @@ class ImageGrid:
         for axis in (0, 1):
             spectra[light.where, 1 + axis] -= 1j * (light.wave[:, axis] * self.pixel).astype(np.float32) * diffracted
         spectra[light.where, 3 : 3 + rims.response.shape[2]] += slopes * turn[:, None]
-
-
-def _both_axes(count: int) -> np.ndarray:
-    """Return the sums over so many points of what goes along x and along y, shape [2 * count, 2]."""
-    return np.kron(np.eye(2, dtype=np.float32), np.ones((count, 1), dtype=np.float32))
 
 
 def _variance(edge: float) -> float:

@@ -32,6 +32,10 @@ from .vignetting import MovableRim, cells_with_rims, movable_rims, shift_spread
 _SURVEY = 48
 #: The same for the distance to its focus.
 _FEW = 16
+#: Cells across the pupil of sharp images over those of :data:`_SPACING` where errors are large, and the error of the
+#: photons [m] from which on they are: such cells leave 4 to 8 nm.
+_COARSER = 0.7
+_LARGE_ERROR = 2e-8
 #: Least number of cells across the pupil for the model of an image.
 _FEWEST = 48
 #: Largest number of cells across the pupil that a model takes by itself: 0.5 million of them.
@@ -222,6 +226,8 @@ class Instrument:
         if sharp:
             leave, least = _BARE_LEAVE if width < _BARE * distance else _SHARP_LEAVE, _SHARP_ERROR
         finer = max((leave / (_SMALL * max(error, least))) ** _FALL, 1.0)
+        if sharp and _LARGE_ERROR < error < math.inf:
+            finer = _COARSER
         across = self.model.n_pupil or min(max(math.ceil(finer * light.diameter / spacing), _FEWEST), _MOST)
         return Sampling(sharp, across)
 

@@ -101,7 +101,7 @@ class Linearized:
         Pixels that count.
     residual : ndarray, shape [n_pixel]
         Residuals of the pixels in use [electron].
-    pulls : ndarray, shape [n_pixel]
+    pulls : ndarray of float32, shape [n_pixel]
         The same over their standard deviations.
     columns : ndarray of float32, shape [n_pixel, n]
         Derivatives with respect to the unknowns of the star and its wavefront, over their scales.
@@ -118,10 +118,20 @@ class Linearized:
     columns: np.ndarray
     scales: np.ndarray
 
+    def over_noise(self, columns: np.ndarray) -> np.ndarray:
+        """Return columns of all pixels [ny, nx, k] at those in use, over their standard deviations, [n_pixel, k]."""
+        # A slice where all pixels are used, since that is no copy.
+        used = self.used if not self.used.all() else np.s_[:, :]
+        root = (1.0 / np.sqrt(self.variance[used].ravel())).astype(np.float32)
+        return np.asarray(columns[used].reshape(len(root), -1) * root[:, None])
 
-@dataclass(frozen=True)
+
+@dataclass
 class _Derivatives:
-    """Image at unknowns of a star, its derivatives and their scales, where its light lands, and chi-square a pixel."""
+    """Image at unknowns of a star, its derivatives and their scales, where its light lands, and chi-square a pixel.
+
+    The curvature is that of the derivatives over the noise of a stamp, without their scales, once it was computed.
+    """
 
     rays: LightRays
     unknowns: np.ndarray
@@ -129,6 +139,7 @@ class _Derivatives:
     weights: np.ndarray
     image: tuple[np.ndarray, np.ndarray, np.ndarray]
     misfit: float
+    curvature: tuple[Stamp, np.ndarray] | None = None
 
     def holds(self, stamp: Stamp, unknowns: np.ndarray, landing: np.ndarray, weights: np.ndarray) -> bool:
         """Return whether the derivatives are those of light that lands elsewhere, too, but for a few per cent."""
@@ -143,7 +154,7 @@ class _Derivatives:
         looser = (_COARSE if grid.coarse else 1.0) / max(self.misfit, 1.0)
         return bool(
             distance <= looser * (_STILL_SHARP if grid.sharp else _STILL) * grid.pixel
-            and abs(after - before) <= looser * _SAME * before
+            and (abs(after - before) <= looser * _SAME * before or grid.unblurred(max(before, after)))
             and np.abs(weights - self.weights).sum() <= looser * _SAME
         )
 
@@ -196,7 +207,8 @@ def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Lineariz
     root = (1.0 / np.sqrt(variance[used].ravel())).astype(np.float32)
     scaled = columns[used].reshape(len(root), -1) * root[:, None]
     brightness = unknowns[FLUX] * columns[..., FLUX].astype(np.float64)
-    point = Linearized(model, variance, brightness, stamp.used, residual, residual * root, scaled, scales)
+    over_noise = residual.astype(np.float32) * root
+    point = Linearized(model, variance, brightness, stamp.used, residual, over_noise, scaled, scales)
     stamp.grid.point = _Point(stamp, unknowns.copy(), wave.copy(), point)
     return point
 
@@ -227,8 +239,7 @@ def light_columns(
     response = np.zeros((2, len(rates), 0), dtype=np.float32)
     columns, scales = stamp.grid.derivatives(unknowns, light, response, rates)[1:]
     count = rates.shape[1]
-    root = (1.0 / np.sqrt(point.variance[point.used])).astype(np.float32)
-    gained = columns[point.used][:, columns.shape[-1] - count :] * root[:, None]
+    gained = point.over_noise(columns[..., columns.shape[-1] - count :])
     return gained - np.outer(point.columns[:, FLUX], rates.sum(axis=0).astype(np.float32)), scales[-count:]
 
 
@@ -242,22 +253,30 @@ def wavefront_columns(
     landing, response = rays.landing(wave), rays.response(wave)
     light = _landed(replace(stamp, rays=rays), wave, landing, response)
     columns, scales = stamp.grid.derivatives(unknowns, light, response, rays.rates[:, :0])[1:]
-    root = (1.0 / np.sqrt(point.variance[point.used])).astype(np.float32)
     first = len(unknowns)
-    return columns[point.used][:, first:] * (root[:, None] * scales[first:].astype(np.float32))
+    return point.over_noise(columns[..., first:]) * scales[first:].astype(np.float32)
 
 
 def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> NormalEquations:
     """Return the normal equations of one star; unknowns are those of the star, then of its wavefront."""
-    point = linearized(stamp, unknowns, wave)
-    if point is None:
+    derivatives = _derivatives(stamp, unknowns, wave)
+    if derivatives is None:
         n = len(unknowns) + len(wave)
         return NormalEquations(np.zeros((n, n)), np.zeros(n), np.inf, np.inf)
-    curvature = point.columns.T @ point.columns * np.outer(point.scales, point.scales)
-    gradient = point.columns.T @ point.pulls * point.scales
-    variance = point.variance[point.used]
-    chi2 = float(point.residual @ (point.residual / variance))
-    return NormalEquations(curvature, gradient, _loss(point.residual, variance), chi2)
+    model, columns, scales = derivatives
+    variance, last = _variance(stamp, model), stamp.grid.last
+    assert isinstance(last, _Derivatives)
+    pixels = columns.reshape(-1, columns.shape[-1])
+    if last.curvature is None or last.curvature[0] is not stamp:
+        root = np.where(stamp.used, 1.0 / np.sqrt(variance), 0.0).astype(np.float32)
+        scaled = pixels * root.reshape(-1, 1)
+        last.curvature = stamp, scaled.T @ scaled
+    residual = stamp.image - model
+    slopes = np.where(stamp.used, residual / variance, 0.0).astype(np.float32)
+    gradient = pixels.T @ slopes.ravel() * scales
+    residual, variance = residual[stamp.used], variance[stamp.used]
+    chi2 = float(residual @ (residual / variance))
+    return NormalEquations(last.curvature[1] * np.outer(scales, scales), gradient, _loss(residual, variance), chi2)
 
 
 def model_image(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> np.ndarray:

@@ -10,11 +10,16 @@ is taken off again. The values are tabulated by the place of the cell within a p
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
+import warp as wp
 from scipy.signal import fftconvolve
-from scipy.sparse import csc_array
 from scipy.special import ndtr
+
+from ..core.launch import launch
+from ..core.warp_arrays import warp_array
+from .deposit_kernels import deposit_points
 
 #: Places within a pixel at which kernels are tabulated; between them they are straight.
 _PHASES = 256
@@ -23,6 +28,8 @@ _REACH = 3.7
 #: Boxes that an evenly lit cell is convolved with: with two, cells whose images stand a few per cent nearer to each
 #: other than the mean still add up to even light, to 1e-4; one box leaves that difference itself.
 _MORE_BOXES = 2
+#: Distance from a stamp at which all points have none of their light on it [pixels].
+_FAR = 1e4
 #: Narrowest Gaussian and cell [pixels]; narrower ones are as sharp.
 _NARROW = 1e-6
 
@@ -65,27 +72,19 @@ class PixelKernel:
         value, slope = (fftconvolve(v @ signs, smooth, mode="same") for v in (integral, steps))
         lines = [line - 0.5 * excess * bent(line) for line in (value, slope)]
         self._half = half
-        self._tables = [
-            line[beyond : beyond + 2 * half * _PHASES].reshape(2 * half, _PHASES)[::-1].astype(np.float32)
-            for line in (*lines, *map(bent, lines))
-        ]
+        tables = np.array([*lines, *map(bent, lines)])[:, beyond : beyond + 2 * half * _PHASES]
+        self._tables = np.ascontiguousarray(tables.reshape(4, 2 * half, _PHASES)[:, ::-1], dtype=np.float32)
 
-    @property
-    def margin(self) -> int:
-        """Pixels that a point just inside of a stamp reaches beyond it."""
-        return self._half
-
-    def taps(self, places: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
-        """Return the kernel and its first three derivatives [n_tap, n] at places, and the first pixel of each [n]."""
+    def taps(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the kernel and its first three derivatives [4, n_tap, n] at places, and the first pixel of each."""
         low = np.floor(places)
         within = (places - low) * _PHASES
         phase = np.minimum(within.astype(np.int32), _PHASES - 1)
-        value, slope, bend, twist = (table[:, phase] for table in self._tables)
+        taps = np.take(self._tables, phase, axis=2)
         # Rounding alone would make likelihoods as rough as their last steps.
         beyond = ((within - phase - 0.5) / _PHASES).astype(np.float32)
-        value += beyond * slope
-        slope += beyond * bend
-        return [value, slope, bend, twist], low.astype(np.int32) - (self._half - 1)
+        taps[:2] += beyond * taps[1:3]
+        return taps, low.astype(np.int32) - (self._half - 1)
 
 
 class SharpCore:
@@ -101,43 +100,41 @@ class SharpCore:
         Rms of the blur of the detector along each axis [pixels].
     footprint : ndarray, shape [2, 2]
         Sides of the image of a cell [pixels], columns of a matrix.
-    widest : float
-        Largest variance of a further Gaussian blur [pixels^2].
     """
 
-    def __init__(self, shape: tuple[int, int], width: float, rms: float, footprint: np.ndarray, widest: float) -> None:
+    def __init__(self, shape: tuple[int, int], width: float, rms: float, footprint: np.ndarray) -> None:
         self._shape, self._width, self._rms = shape, width, rms
         # A rectangle along the axes with the second moments of the cell but for the mixed one, which is a spread.
         self._cell = np.hypot(*footprint.T)
         self._mixed = (footprint @ footprint.T)[0, 1] / 12.0 * np.array([[0.0, 1.0], [1.0, 0.0]])
-        self._margin = max(kernel.margin for kernel in self._at(widest))
-        self._size = (shape[0] + 2 * self._margin, shape[1] + 2 * self._margin)
 
     def deposit(self, points: np.ndarray, spread: np.ndarray, variance: float) -> Deposit:
-        """Return what points add to the pixels of the stamp and of a margin.
+        """Return what points add to the pixels of the stamp.
 
         Points are places (x, y) from the centre of the stamp, spreads their second moments beside the footprint, and
         the variance is that of a further Gaussian blur, all in pixels.
         """
         taps, indices = [], []
         for axis, kernel in enumerate(self._at(variance)):
-            count = self._size[1 - axis]
-            values, first = kernel.taps(np.clip(points[:, axis] + 0.5 * (count - 1), -1.0, count))
+            count = self._shape[1 - axis]
+            # Points far beside the stamp have no light on it.
+            values, first = kernel.taps(np.clip(points[:, axis] + 0.5 * (count - 1), -_FAR, count + _FAR))
             taps.append(values)
-            # Light beside the stamp stays in its margin.
-            index = first + np.arange(len(values[0]), dtype=np.int32)[:, None]
-            indices.append(np.clip(index, 0, count - 1))
-        return Deposit((taps[0], taps[1]), (indices[0], indices[1]), self._size, spread + self._mixed)
-
-    def pixels(self, deposited: np.ndarray) -> np.ndarray:
-        """Return the pixels of the stamp [ny, nx, k] of sums of deposits [n_cell, k]."""
-        rows, columns = (slice(self._margin, self._margin + n) for n in self._shape)
-        return np.asarray(deposited.reshape(*self._size, -1)[rows, columns])
+            index = first + np.arange(values.shape[1], dtype=np.int32)[:, None]
+            index[index >= count] = -1
+            indices.append(index)
+        return Deposit((taps[0], taps[1]), (indices[0], indices[1]), self._shape, spread + self._mixed)
 
     def _at(self, variance: float) -> list[PixelKernel]:
         """Return the kernels along x and y under a further blur."""
         rms = math.hypot(self._rms, math.sqrt(variance))
-        return [PixelKernel(cell, self._width, rms) for cell in self._cell]
+        return [_kernel(float(cell), self._width, rms) for cell in self._cell]
+
+
+@lru_cache(maxsize=16)
+def _kernel(cell: float, width: float, rms: float) -> PixelKernel:
+    """Return the kernel of one axis: several images in a row have the same."""
+    return PixelKernel(cell, width, rms)
 
 
 class Deposit:
@@ -145,9 +142,9 @@ class Deposit:
 
     Parameters
     ----------
-    taps : two lists of four ndarray, shape [n_tap, n]
+    taps : two ndarray of float32, shape [4, n_tap, n]
         Kernel along x and along y with its first three derivatives.
-    indices : two ndarray of int, shape [n_tap, n]
+    indices : two ndarray of int32, shape [n_tap, n]
         Columns and rows of the grid.
     size : tuple of int
         Rows and columns of the grid.
@@ -157,37 +154,55 @@ class Deposit:
 
     def __init__(
         self,
-        taps: tuple[list[np.ndarray], list[np.ndarray]],
+        taps: tuple[np.ndarray, np.ndarray],
         indices: tuple[np.ndarray, np.ndarray],
         size: tuple[int, int],
         spread: np.ndarray,
     ) -> None:
-        (self._x, self._y), self._cell_count, self._count = taps, size[0] * size[1], len(spread)
-        self._cells = _by_point(indices[1][:, None] * np.int32(size[1]) + indices[0])
-        self._taps = len(indices[0]) * len(indices[1])
-        self._spread = (spread[:, [0, 0, 1], [0, 1, 1]] * [0.5, 1.0, 0.5]).astype(np.float32).T
+        moments = (spread[:, [0, 0, 1], [0, 1, 1]] * [0.5, 1.0, 0.5]).T
+        self._count, self._size = len(spread), size
+        self._arguments = [
+            *(warp_array(v, wp.float32) for v in taps),
+            *(warp_array(v, wp.int32) for v in indices),
+            size[1],
+            warp_array(moments, wp.float32),
+        ]
 
-    def matrix(self, i: int, j: int) -> csc_array:
-        """Return the derivative of order i along x and j along y, 0 or 1, as a sparse matrix [n_cell, n]."""
-        return self._matrix(self._values(i, j, 1))
+    def light(self, weights: np.ndarray) -> np.ndarray:
+        """Return the light of weighted points [n] on the cells, shape [n_cell, 1]."""
+        return self._deposited(weights, np.zeros((2, self._count, 0)), np.zeros((self._count, 0)), 1.0, 1)
 
-    def gradient(self, weights: np.ndarray) -> csc_array:
-        """Return the derivatives along x and then along y of weighted points, shape [n_cell, 2 * n]."""
-        return self._matrix(self._values(1, 0, weights), self._values(0, 1, weights))
+    def derivatives(
+        self, weights: np.ndarray, response: np.ndarray, rates: np.ndarray, scale: float, head: int = 3
+    ) -> np.ndarray:
+        """Return the light of points on the cells and its derivatives.
 
-    def _values(self, i: int, j: int, weights: np.ndarray | int) -> np.ndarray:
-        x, y, (half_xx, xy, half_yy) = self._x, self._y, self._spread
-        values = ((y[j] + half_yy * y[j + 2]) * weights)[:, None] * (x[i] + half_xx * x[i + 2])
-        values += (y[j + 1] * (xy * weights))[:, None] * x[i + 1]
-        return _by_point(values)
+        Parameters
+        ----------
+        weights : ndarray, shape [n]
+            Weights of the points.
+        response : ndarray, shape [2, n, k]
+            Derivatives of their places by some unknowns.
+        rates : ndarray, shape [n, j]
+            Derivatives of their weights by others.
+        scale : float
+            Cells in a unit of the response.
+        head : int
+            Columns before those of the response.
 
-    def _matrix(self, *parts: np.ndarray) -> csc_array:
-        n = len(parts) * self._count
-        starts = np.arange(n + 1, dtype=np.int32) * np.int32(self._taps)
-        values, cells = (v[0] if len(parts) == 1 else np.concatenate(v) for v in (parts, len(parts) * (self._cells,)))
-        return csc_array((values, cells, starts), shape=(self._cell_count, n))
+        Returns
+        -------
+        ndarray of float32, shape [n_cell, head + k + j]
+            The light, its derivatives along x and y, further columns, and the derivatives by the unknowns.
+        """
+        return self._deposited(weights, response, rates, scale, head)
 
-
-def _by_point(taps: np.ndarray) -> np.ndarray:
-    """Return values of the cells of n points, shape [rows, columns, n], point by point, flat."""
-    return np.ascontiguousarray(taps.reshape(-1, taps.shape[-1]).T).ravel()
+    def _deposited(
+        self, weights: np.ndarray, response: np.ndarray, rates: np.ndarray, scale: float, head: int
+    ) -> np.ndarray:
+        columns = head + response.shape[2] + rates.shape[1]
+        cells = np.zeros((self._size[0] * self._size[1], columns), dtype=np.float32)
+        values = (warp_array(v, wp.float32) for v in (weights, response, rates))
+        arguments = [*self._arguments, *values, scale, head, warp_array(cells, wp.float32)]
+        launch(deposit_points, 1, arguments, threads=1)
+        return cells

@@ -21,15 +21,19 @@ from ..raytrace.launch import aimed_points
 from ..raytrace.rays import RayStatus, parallel_rays
 from ..raytrace.trace import trace
 from ..wavefront.pupil_polynomials import PupilPolynomials
+from .rim_outlines import is_vane, simple_regions
 
 #: Side of the lattice over the diameter of the pupil: light off the axis may cross the plane of the stop just outside.
 _MARGIN = 1.02
-#: Chords of a cell on a rim.
+#: Chords of a cell on a rim, and divisions of the piece between two nodes that has a rim: they find it to a 500th of a
+#: cell. Of the small cells of a lattice with so many across the pupil, fewer are as fine.
 _CHORDS = 8
+_DIVISIONS = 3
+_CHORDS_OF_SMALL = 4
+_DIVISIONS_OF_SMALL = 2
+_SMALL = 120
 #: Nodes along each chord.
 _NODES = 5
-#: Divisions of the piece between two nodes that has a rim: they find it to a 500th of a cell.
-_DIVISIONS = 3
 #: Pieces that each division makes.
 _PARTS = 4
 #: Points of the rim that the width of an aimed beam is taken from.
@@ -155,7 +159,11 @@ def pupil_cells(telescope: Telescope, direction: np.ndarray, wavelength: float, 
     centers = np.stack(np.meshgrid(middle, middle), axis=-1) + center
     # Four points of each cell; a rim passes cells where these or those next to them differ.
     along = (np.arange(2 * across) - 0.5 * (2 * across - 1)) * 0.5 * side
-    status = lit(np.stack(np.meshgrid(along, along), axis=-1) + center)
+    lattice = np.stack(np.meshgrid(along, along), axis=-1) + center
+    # Thin shadows may lie between the points of half a lattice.
+    regions = (region for s in telescope.surfaces for region in simple_regions(s.aperture))
+    thin = bool(telescope.obstructions) or any(map(is_vane, regions))
+    status = lit(lattice) if thin else lit_lattice(lit, lattice)
     differ = maximum_filter(status, 3, mode="constant") != minimum_filter(status, 3, mode="constant")
     quarters = (across, 2, across, 2)
     area, rim = status.reshape(quarters).mean(axis=(1, 3)), differ.reshape(quarters).any(axis=(1, 3))
@@ -164,7 +172,8 @@ def pupil_cells(telescope: Telescope, direction: np.ndarray, wavelength: float, 
         smooth = uniform_filter(area, 3, mode="constant")
         down, across_rim = np.gradient(smooth)
         upright = np.abs(down[rim]) > np.abs(across_rim[rim])
-        area[rim], offset, moments[rim] = _lit_parts(lit, centers[rim], side, upright)
+        fineness = (_CHORDS_OF_SMALL, _DIVISIONS_OF_SMALL) if across > _SMALL else (_CHORDS, _DIVISIONS)
+        area[rim], offset, moments[rim] = _lit_parts(lit, centers[rim], side, upright, *fineness)
         centers[rim] += offset
     lit_cells = area > 0.0
     total = max(float(area.sum()), 1e-300)
@@ -183,8 +192,24 @@ def _beam(telescope: Telescope, direction: np.ndarray, wavelength: float) -> tup
     return 0.5 * (low + high), float((high - low).max())
 
 
+def lit_lattice(lit: Callable[[np.ndarray], np.ndarray], points: np.ndarray) -> np.ndarray:
+    """Return which points of a lattice [n, n, 2] are lit; of a fine one a quarter, and those by rims, are traced."""
+    if len(points) <= 2 * _SMALL:
+        return lit(points)
+    # Points have the status of those that are traced unless others near have another one.
+    status = np.repeat(np.repeat(lit(points[::2, ::2]), 2, axis=0), 2, axis=1)
+    near = maximum_filter(status, 7, mode="constant") != minimum_filter(status, 7, mode="constant")
+    status[near] = lit(points[near])
+    return status
+
+
 def _lit_parts(
-    lit: Callable[[np.ndarray], np.ndarray], centers: np.ndarray, side: float, upright: np.ndarray
+    lit: Callable[[np.ndarray], np.ndarray],
+    centers: np.ndarray,
+    side: float,
+    upright: np.ndarray,
+    chords: int,
+    divisions: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return lit fractions [n], centroids from the centre [n, 2] and second moments [n, 2, 2], by chords.
 
@@ -192,7 +217,7 @@ def _lit_parts(
     status.
     """
     node = side * np.linspace(-0.5, 0.5, _NODES)
-    row = side * ((np.arange(_CHORDS) + 0.5) / _CHORDS - 0.5)
+    row = side * ((np.arange(chords) + 0.5) / chords - 0.5)
 
     def places(along: np.ndarray, across: np.ndarray, cell: np.ndarray) -> np.ndarray:
         offset = np.stack(np.broadcast_arrays(along, across), axis=-1)
@@ -200,13 +225,13 @@ def _lit_parts(
         return centers[cell].reshape(-1, *[1] * (offset.ndim - 2), 2) + np.where(turned, offset[..., ::-1], offset)
 
     indices = np.arange(len(centers))
-    across = np.broadcast_to(row[:, None], (len(centers), _CHORDS, _NODES))
+    across = np.broadcast_to(row[:, None], (len(centers), chords, _NODES))
     status = lit(places(np.broadcast_to(node, across.shape), across, indices))
-    start, end = np.broadcast_to(node[:-1], (len(centers), _CHORDS, _NODES - 1)), node[1:]
+    start, end = np.broadcast_to(node[:-1], (len(centers), chords, _NODES - 1)), node[1:]
     low, high = start * np.ones(1), end * np.ones(start.shape)
     cell, chord, piece = np.nonzero(status[:, :, 1:] != status[:, :, :-1])
     first, last, begins = node[piece], node[piece + 1], status[cell, chord, piece]
-    for _ in range(_DIVISIONS):
+    for _ in range(divisions):
         step = (last - first) / _PARTS
         inner = first[:, None] + step[:, None] * np.arange(1, _PARTS)
         # Parts before the first change of status; of several rims, the first.
@@ -225,13 +250,13 @@ def _lit_parts(
 
     u, v = mean(middles), mean(rows)
     uu = mean(middles**2 + length**2 / 12.0) - u * u
-    vv = mean(rows**2 + (side / _CHORDS) ** 2 / 12.0) - v * v
+    vv = mean(rows**2 + (side / chords) ** 2 / 12.0) - v * v
     uv = mean(middles * rows) - u * v
     moments = np.stack([np.stack([uu, uv], axis=-1), np.stack([uv, vv], axis=-1)], axis=-1)
     offset = np.stack([u, v], axis=-1)
     turned = upright[:, None]
     return (
-        total / (side * _CHORDS),
+        total / (side * chords),
         np.where(turned, offset[:, ::-1], offset),
         np.where(turned[:, :, None], moments[:, ::-1, ::-1], moments),
     )

@@ -23,6 +23,7 @@ as much in all of them, a rim elsewhere for example, is taken for noise of a lar
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -134,19 +135,18 @@ def residual_power(
     root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     squares = _Squares(linearized.used)
     columns = squares.of(linearized.columns @ (linearized.scales[:, None] * root).astype(np.float32))
-    pulls = squares.of(linearized.pulls.astype(np.float32)[:, None])[:, 0]
+    pulls = squares.of(linearized.pulls[:, None].astype(np.float32))[:, 0]
     if prior_gradient is not None:
         pulls = pulls - columns @ (columns.T @ pulls - root.T @ prior_gradient).astype(np.float32)
     beside = None if patterns is None else _Patterns.of(squares.of(patterns), columns, pulls)
     if beside is not None:
         pulls, columns = pulls - beside.columns @ beside.amplitudes, np.hstack([columns, beside.columns])
     n, strength = len(root), 0.0
-    residuals = _Residuals(squares.used, pulls, columns)
-    fields = _fields(linearized, squares, resolution)
-    if max(residuals.excess(fields[name]) for name in _SCREENED) < _SIGNIFICANT:
+    residuals = _Residuals(squares.used, pulls, columns, _fields(linearized, squares, resolution))
+    if max(residuals.excess(name) for name in _SCREENED) < _SIGNIFICANT:
         inner, of_patterns = np.zeros((n, n)), np.zeros((columns.shape[1] - n,) * 2)
     else:
-        inner, of_patterns = residuals.power(fields, n)
+        inner, of_patterns = residuals.power(n)
     if beside is not None:
         known = np.zeros_like(of_patterns) if expected is None else beside.power_of(squares.of(expected))
         strength, level = beside.sizes(of_patterns + known)
@@ -176,7 +176,7 @@ class _Patterns:
     def of(cls, patterns: np.ndarray, columns: np.ndarray, pulls: np.ndarray) -> _Patterns:
         """Return what patterns [n_pixel, m] have beside the columns of the unknowns, and their amplitudes in pulls."""
         beside = patterns - columns @ (columns.T @ patterns)
-        variances, vectors = np.linalg.eigh(patterns.T.astype(np.float64) @ beside)
+        variances, vectors = np.linalg.eigh((patterns.T @ beside).astype(np.float64))
         shown = variances > _FAINTEST * variances[-1]
         vectors = vectors[:, shown] / np.sqrt(variances[shown])
         amplitudes = vectors.T @ (patterns.T @ pulls)
@@ -266,9 +266,16 @@ class _Squares:
         """Return columns of pixels in use [n_pixel, n] as those of squares, [n_square, n]."""
         if self.side == 1:
             return columns
-        images = np.zeros((*self._used.shape, columns.shape[1]), dtype=columns.dtype)
-        images[self._used] = columns
-        return np.asarray(self._cut(images).sum(axis=(1, 3))[self.used] / self.side)
+        images = columns
+        if not self._used.all():
+            images = np.zeros((self._used.size, columns.shape[1]), dtype=columns.dtype)
+            images[self._used.ravel()] = columns
+        squares = self._cut(images.reshape(*self._used.shape, -1))
+        total = np.zeros_like(squares[:, 0, :, 0])
+        # One place in the squares after the other: sums over two axes at once take several times as long.
+        for i, j in itertools.product(range(self.side), repeat=2):
+            total += squares[:, i, :, j]
+        return np.asarray(total[self.used] / self.side)
 
     def mean(self, image: np.ndarray) -> np.ndarray:
         """Return an image [ny, nx] by the means of squares."""
@@ -276,63 +283,58 @@ class _Squares:
 
 
 class _Residuals:
-    """Residuals over their noise [n_pixel], and changes of the image by independent unknowns [n_pixel, n].
+    """Residuals over their noise [n_pixel], changes of the image by independent unknowns [n_pixel, n], and fields.
 
     What a fit has taken from the power of fields is a small part of it, and computed by sums over pairs of rows and
     columns, in which the changes are nearly even.
     """
 
-    def __init__(self, used: np.ndarray, pulls: np.ndarray, columns: np.ndarray) -> None:
-        self._pulls, self._columns = pulls, columns
-        pairs = [_pairs(n) for n in used.shape]
-        self._pairs = pairs[0], pairs[1]
+    def __init__(self, used: np.ndarray, pulls: np.ndarray, columns: np.ndarray, fields: Mapping[str, Field]) -> None:
+        self._pulls, self._columns, self._fields = pulls, columns, fields
+        self._pairs = _pairs(used.shape[0]), _pairs(used.shape[1])
         images = np.zeros((*used.shape, columns.shape[1]), dtype=np.float32)
         images[used] = columns
         self._sums = _along_both(*self._pairs, images)
-        self._products: dict[int, tuple[Field, np.ndarray]] = {}
-        self._surpluses: dict[int, tuple[Field, float]] = {}
+        self._times_sums: dict[str, np.ndarray] = {}
 
-    def _of_sums(self, field: Field) -> np.ndarray:
-        """Return the covariance of a field times the sums of the changes of the image, [n_pair, n]."""
-        if id(field) not in self._products:
-            values = field.times_sums(self._sums, *self._pairs)
-            self._products[id(field)] = field, values.reshape(-1, self._sums.shape[-1])
-        return self._products[id(field)][1]
+    def _of_sums(self, name: str) -> np.ndarray:
+        """Return the covariance of a field times the sums of the changes of the image, [my, mx, n]."""
+        if name not in self._times_sums:
+            self._times_sums[name] = self._fields[name].times_sums(self._sums, *self._pairs)
+        return self._times_sums[name]
 
-    def _surplus(self, of_field: Field) -> float:
+    def _surplus(self, name: str) -> float:
         """Return the power of the residuals in a field beyond that of noise."""
-        if id(of_field) not in self._surpluses:
-            energy = float(self._pulls @ of_field.times(self._pulls[:, None])[:, 0])
-            taken = float(np.vdot(self._sums, self._of_sums(of_field)))
-            self._surpluses[id(of_field)] = of_field, energy - of_field.trace + taken
-        return self._surpluses[id(of_field)][1]
+        field = self._fields[name]
+        energy = float(self._pulls @ field.times(self._pulls[:, None])[:, 0])
+        return energy - field.trace + float(np.vdot(self._sums, self._of_sums(name)))
 
-    def excess(self, of_field: Field) -> float:
+    def excess(self, name: str) -> float:
         """Return the surplus in a field in standard deviations of noise."""
-        return self._surplus(of_field) / np.sqrt(2.0 * of_field.product(of_field))
+        return self._surplus(name) / math.sqrt(2.0 * self._fields[name].product(self._fields[name]))
 
-    def power(self, fields: Mapping[str, Field], n: int) -> tuple[np.ndarray, np.ndarray]:
+    def power(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the power of the fields that the residuals need in the first n unknowns, and in the others."""
-        listed = list(fields.values())
-        of_sums = [self._of_sums(of_field) for of_field in listed]
+        names = list(self._fields)
         sums = self._sums.reshape(-1, self._sums.shape[-1])
-        inner = [sums.T @ values for values in of_sums]
-        surplus = np.array([self._surplus(of_field) for of_field in listed])
-        of_unknowns, of_pixels = (np.stack([v.ravel() for v in values]) for values in (inner, of_sums))
-        products = (of_unknowns @ of_unknowns.T - 2.0 * (of_pixels @ of_pixels.T)).astype(np.float64)
-        for a in range(len(listed)):
-            for b in range(a + 1):
-                products[a, b] += listed[a].product(listed[b])
-                products[b, a] = products[a, b]
+        inner = [sums.T @ self._of_sums(name).reshape(sums.shape) for name in names]
+        surplus = np.array([self._surplus(name) for name in names])
+        products = np.zeros((len(names), len(names)))
+        for a, first in enumerate(names):
+            for b, second in enumerate(names[: a + 1]):
+                taken = np.vdot(inner[a], inner[b]) - 2.0 * np.vdot(self._of_sums(first), self._of_sums(second))
+                products[a, b] = products[b, a] = taken + self._fields[first].product(self._fields[second])
         freedom = self._pulls.size - float(np.vdot(self._columns, self._columns))
         level = max(float(self._pulls @ self._pulls) / max(freedom, 1.0), 1.0)
         strengths = _needed_strengths(products, surplus, level, range(1, 1 + len(_NOISE_LENGTHS)))
-        power, first = np.zeros((n, n)), self._columns[:, :n]
-        for k, strength in strengths.items():
-            power += strength * (first.T @ listed[k].times(first))
+        columns = np.ascontiguousarray(self._columns[:, :n])
+        power = sum(
+            (s * (columns.T @ self._fields[names[k]].times(columns)) for k, s in strengths.items()),
+            start=np.zeros((n, n)),
+        )
+        others = sum((s * inner[k][n:, n:] for k, s in strengths.items()), start=np.zeros((len(inner[0]) - n,) * 2))
         # Noise is correlated in pixels: in changes of the image, which are smooth, it is no less than without.
         values, vectors = np.linalg.eigh(power)
-        others = sum((s * inner[k][n:, n:] for k, s in strengths.items()), start=np.zeros((len(inner[0]) - n,) * 2))
         return np.asarray(vectors * np.maximum(values, 0.0) @ vectors.T), np.asarray(others)
 
 

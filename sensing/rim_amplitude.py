@@ -57,7 +57,7 @@ def rim_amplitude(instrument: Instrument, star: StarSolution) -> RimAmplitude | 
     columns, scales = point.columns, point.scales.copy()
     if instrument.known_seeing:
         scales[STRENGTH] = 0.0
-    light_column, residual = diffracted[stamp.used] / np.sqrt(point.variance[stamp.used]), point.pulls
+    light_column, residual = point.over_noise(diffracted[..., None].astype(np.float32))[:, 0], point.pulls
     prior = np.zeros(len(scales))
     precision = np.concatenate([instrument.terms.precision, light.shift_precision])
     prior[len(unknowns) :] = precision

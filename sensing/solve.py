@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from .image_model import FLUX, STRENGTH, neighbours_of
+from .image_model import EXPONENT_GROWTH, FLUX, STRENGTH, neighbours_of
 from .likelihood import NormalEquations, Stamp, normal_equations
 
 #: A step that is to lower twice the negative logarithm of the likelihood by less, per unit of chi-square a pixel, is
@@ -29,6 +29,8 @@ _EXPLAINED = 1e-2
 _DAMPING = 1e-3
 #: Least strength of the turbulence [1/m].
 _LEAST_STRENGTH = 1e-3
+#: Least exponent of the air's transfer function after a step over that before: images are then a fifth as wide.
+_LEAST_EXPONENT = 0.07
 #: Damping beyond which no step is tried: none gains anything.
 _LARGEST_DAMPING = 1e6
 
@@ -135,7 +137,7 @@ def solve(
         normalized[np.diag_indices_from(normalized)] = 1.0 + damping
         step[free] = _solved(normalized, state.gradient[free] / scale) / scale
         predicted = float(state.gradient @ step)
-        trial = _bounded(joined + step, sizes, held)
+        trial = _bounded(after_step(joined, step, sizes), sizes, held)
         if predicted < tolerance * max(1.0, state.loss / pixels):
             joined, converged = trial, True
             break
@@ -231,6 +233,20 @@ def _pressed(joined: np.ndarray, gradient: np.ndarray, sizes: list[int]) -> np.n
         at = first + STRENGTH
         pressed[at] = joined[at] <= _LEAST_STRENGTH and gradient[at] < 0.0
     return pressed
+
+
+def after_step(joined: np.ndarray, step: np.ndarray, sizes: list[int]) -> np.ndarray:
+    """Return unknowns after a step, which is one of the exponent of the air's transfer function.
+
+    An image that the air hardly blurs changes in proportion to that, and not at all with a strength near zero.
+    """
+    moved = joined + step
+    for first in np.cumsum([0, *sizes[:-1]]):
+        before, change = joined[first + STRENGTH], step[first + STRENGTH]
+        if before > 0.0:
+            exponent = max(1.0 + EXPONENT_GROWTH * change / before, _LEAST_EXPONENT)
+            moved[first + STRENGTH] = before * exponent ** (1.0 / EXPONENT_GROWTH)
+    return moved
 
 
 def _bounded(joined: np.ndarray, sizes: list[int], held: np.ndarray) -> np.ndarray:

@@ -38,6 +38,8 @@ _ROUNDS = 3
 _SCALES = 3
 #: Most steps of a fit with few cells that finds the seeing.
 _SEEING_STEPS = 8
+#: Cells across the pupil beyond which the seeing is found with fewer.
+_MANY = 250
 #: Fraction of the seeing that a search starts from below which that of a first solution is taken in its place.
 _MUCH_SHARPER = 0.5
 #: Cells across the pupil beyond those of a first search from which on it has some of its own.
@@ -298,23 +300,27 @@ class StarFitter:
                 # An image that is far sharper than the start of the search is not summed for that.
                 sharper = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
                 fwhm = sharper if sharper < _MUCH_SHARPER * fwhm else fwhm
-            pixels, sampling = self._sampling(fwhm, self._side(fwhm))
-            if sampling.sharp and not instrument.known_seeing and instrument.model.n_pupil is None:
+            pixels, sampling = self._sampling(fwhm, self._side(fwhm), self._error(solution))
+            seeing_is_free = not instrument.known_seeing and instrument.model.n_pupil is None
+            if sampling.sharp and seeing_is_free and sampling.across > _MANY:
                 # Few large cells find the seeing, of which a sharp image says much.
                 sampling, few_cells = replace(sampling, across=sampling.across // 2), True
         else:
             fwhm = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
-            wave = slice(len(instrument.noll)) if len(solution.shared) else slice(0)
             # Pixels without noise, whatever variance is claimed for them, know the wavefront better than claimed.
-            noise = min(solution.loss / last.stamp.used.sum(), 1.0)
-            variance = noise * np.trace(solution.shared_covariance[wave, wave])
-            # Rounding may leave a negative one of donuts far brighter than detectors have.
-            error = math.sqrt(variance) if variance > 0.0 else math.inf
+            error = math.sqrt(min(solution.loss / last.stamp.used.sum(), 1.0)) * self._error(solution)
             if not self._sampling(_ENOUGH * fwhm, last.pixels.side, _ENOUGH * error)[1].finer_than(last.sampling):
                 return last
             pixels, sampling = self._sampling(fwhm, min(self._side(fwhm), last.pixels.side), error)
         stamp = self.sampled_stamp(pixels, sampling, light.diameter if blended else self._overhang(solution))
         return _Fine(stamp, pixels, sampling, few_cells)
+
+    def _error(self, solution: Solution) -> float:
+        """Return the error of the wavefront by photons [m], infinite without one."""
+        wave = slice(len(self.instrument.noll)) if len(solution.shared) else slice(0)
+        variance = float(np.trace(solution.shared_covariance[wave, wave]))
+        # Rounding may leave a negative one of donuts far brighter than detectors have.
+        return math.sqrt(variance) if variance > 0.0 else math.inf
 
     def _overhang(self, solution: Solution) -> float:
         """Return how far the light of a star reaches beyond the stamp [m]."""

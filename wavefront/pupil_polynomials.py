@@ -33,10 +33,7 @@ class PupilPolynomials:
 
     def _terms(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return monomials at points [n, 2], shape [m, n], and their derivatives along x and y [1/m], [2, m, n]."""
-        powers = np.ones((2, _DEGREE + 1, len(points)))
-        powers[:, 1] = (points - self._center).T / self._radius
-        for k in range(2, _DEGREE + 1):
-            np.multiply(powers[:, k - 1], powers[:, 1], out=powers[:, k])
+        powers = self._powers(points)
         slopes = np.zeros_like(powers)
         slopes[:, 1:] = powers[:, :-1] * (_POWERS[1:, None] / self._radius)
         (x, y), (slopes_x, slopes_y) = powers, slopes
@@ -44,6 +41,14 @@ class PupilPolynomials:
         for out, along_x, along_y in zip(monomials, (x, slopes_x, x), (y, y, slopes_y), strict=True):
             np.multiply(along_x[_P], along_y[_Q], out=out)
         return monomials[0], monomials[1:]
+
+    def _powers(self, points: np.ndarray) -> np.ndarray:
+        """Return powers of the coordinates of points [n, 2] in units of the radius, shape [2, degree + 1, n]."""
+        powers = np.ones((2, _DEGREE + 1, len(points)))
+        powers[:, 1] = (points - self._center).T / self._radius
+        for k in range(2, _DEGREE + 1):
+            np.multiply(powers[:, k - 1], powers[:, 1], out=powers[:, k])
+        return powers
 
     def fitted(self, values: np.ndarray) -> np.ndarray:
         """Return the coefficients of values [n, k], shape [m, k]."""
@@ -63,5 +68,13 @@ class PupilPolynomials:
 
     def sums(self, points: np.ndarray, fitted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return values and derivatives as :meth:`at`, from the coefficients of :meth:`fitted`."""
-        terms, slopes = self._terms(points)
-        return terms.T @ fitted, np.moveaxis(slopes.transpose(0, 2, 1) @ fitted, 0, -1)
+        coefficients = np.zeros((fitted.shape[1], _DEGREE + 1, _DEGREE + 1))
+        coefficients[:, _P, _Q] = fitted.T
+        x, y = self._powers(points)
+        # Sums over powers of y first: monomials of both take several times as long.
+        along_y = coefficients @ y
+        slopes_y = (coefficients[:, :, 1:] * _POWERS[1:]) @ y[:-1]
+        values = np.einsum("kpn,pn->nk", along_y, x)
+        by_x = np.einsum("kpn,pn->nk", along_y[:, 1:] * _POWERS[1:, None], x[:-1])
+        by_y = np.einsum("kpn,pn->nk", slopes_y, x)
+        return values, np.stack([by_x, by_y], axis=-1) / self._radius

@@ -150,6 +150,16 @@ def test_errors_do_not_depend_on_where_a_search_stopped():
     assert np.trace(power(short, prior=False)) > np.trace(at_the_end) + 3.0 * scale
 
 
+def test_air_over_a_full_pupil_has_terms_by_their_radial_degree():
+    """Closed form: the transform of a Zernike of a disc is a Bessel function of its radial degree (Noll 1976)."""
+    degrees = np.array([noll_to_nm(j)[0] for j in range(4, 79)])
+    variances = np.diag(air_shape(78, 0.0, np.inf))
+    for n in range(2, 12):
+        same = variances[degrees == n]
+        np.testing.assert_allclose(same, same.mean(), rtol=1e-6)
+    assert (np.diff([variances[degrees == n].mean() for n in range(2, 12)]) < 0.0).all()
+
+
 @pytest.mark.long
 def test_air_of_a_long_exposure_has_one_shape():
     """Peer: the closed form of given winds, from which its shape differs by their direction alone."""

@@ -12,10 +12,10 @@ from pachon.sensing.degrees import FreedomRays
 from pachon.sensing.donut_rays import ZernikeRays
 from pachon.sensing.image_model import STRENGTH, ImageGrid, LandedLight
 from pachon.sensing.likelihood import Stamp, model_image, normal_equations
-from pachon.sensing.pixel_kernel import PixelKernel
-from pachon.sensing.pupil_cells import pupil_cells
+from pachon.sensing.pixel_kernel import PixelKernel, SharpCore
+from pachon.sensing.pupil_cells import lit_lattice, pupil_cells
 from pachon.sensing.seeing import Seeing
-from pachon.sensing.solve import Group, solve
+from pachon.sensing.solve import Group, after_step, solve
 from pachon.sensing.stamps import Pixels
 from pachon.wavefront.atmosphere.turbulence import long_exposure_fwhm
 from pachon.wavefront.chief_rays import image_jacobians
@@ -175,6 +175,63 @@ def test_evenly_spaced_cells_light_pixels_evenly():
     np.testing.assert_allclose(pixels[25:65] * 0.52, 1.0, atol=2e-3)
 
 
+def test_deposits_are_sums_over_points():
+    """Oracle: the sums restated, of points on a grid, at its edge and far beside it."""
+    rng = np.random.default_rng(4)
+    (ny, nx), count, pad = (12, 15), 60, 20
+    places = rng.uniform(-9.0, 9.0, (count, 2))
+    spread = 0.02 * rng.normal(size=(count, 2, 2))
+    spread[:, 1, 0] = spread[:, 0, 1]
+    weights, response, rates = rng.random(count), rng.normal(size=(2, count, 11)), rng.normal(size=(count, 3))
+    scale, head = 2.5, 7
+    kernel = PixelKernel(0.7, 1.0, 0.4)
+    expected = np.zeros((ny + 2 * pad, nx + 2 * pad, head + 14))
+    for (px, py), moments, w, r, rate in zip(places, spread, weights, response.swapaxes(0, 1), rates, strict=True):
+        (x, first_x), (y, first_y) = (kernel.taps(np.array([p + 0.5 * (n - 1)])) for p, n in ((px, nx), (py, ny)))
+        x, y = x[..., 0], y[..., 0]
+
+        def image(i, j, x=x, y=y, moments=moments):
+            value = np.outer(y[j] + 0.5 * moments[1, 1] * y[j + 2], x[i] + 0.5 * moments[0, 0] * x[i + 2])
+            return (value + moments[0, 1] * np.outer(y[j + 1], x[i + 1]))[..., None]
+
+        row, column = pad + first_y[0], pad + first_x[0]
+        out = expected[row : row + len(y[0]), column : column + len(x[0])]
+        out[..., :3] += w * np.concatenate([image(0, 0), image(1, 0), image(0, 1)], axis=-1)
+        out[..., head : head + 11] += scale * w * (image(1, 0) * r[0] + image(0, 1) * r[1])
+        out[..., head + 11 :] += image(0, 0) * rate
+    far = np.array([[500.0, 0.0], [-1e7, 3.0]])
+    places, spread, weights, rates = (np.concatenate([v, v[:2]]) for v in (places, spread, weights, rates))
+    places[count:], response = far, np.concatenate([response, response[:, :2]], axis=1)
+    core = SharpCore((ny, nx), 1.0, 0.4, np.diag([0.7, 0.7]))
+    columns = core.deposit(places, spread, 0.0).derivatives(weights, response, rates, scale, head)
+    expected = expected[pad:-pad, pad:-pad]
+    # Single precision.
+    np.testing.assert_allclose(columns.reshape(expected.shape), expected, atol=2e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(("before", "change"), [(10.0, 3.0), (1e-3, 1e3), (0.4, -0.1)])
+def test_steps_of_the_strength_are_those_of_the_exponent(before, change):
+    """Closed form: the exponent of the air's transfer goes as the power 5/3 of the strength."""
+    joined, step = np.zeros(9), np.zeros(9)
+    joined[STRENGTH], step[STRENGTH] = before, change
+    exponent = before ** (5.0 / 3.0) + 5.0 / 3.0 * before ** (2.0 / 3.0) * change
+    assert after_step(joined, step, [9])[STRENGTH] == pytest.approx(exponent**0.6)
+
+
+def test_curvature_is_that_of_the_pixels_in_use(behind_focus):
+    """Fits without clipped pixels share the derivatives of the fit before."""
+    stamp = stamp_of(behind_focus, 30)
+    star, wave = np.array([1e6, 0.0, 0.0, 0.0, 9.0, 0.0, 0.0]), np.zeros(len(NOLL))
+    whole = normal_equations(stamp, star, wave)
+    used = np.arange(SIZE)[:, None] % 2 == np.zeros(SIZE, dtype=int)
+    half = normal_equations(replace(stamp, used=used), star, wave)
+    other = normal_equations(replace(stamp, used=~used), star, wave)
+    np.testing.assert_allclose(
+        half.curvature + other.curvature, whole.curvature, rtol=1e-4, atol=1e-6 * whole.curvature.max()
+    )
+    np.testing.assert_array_equal(normal_equations(stamp, star, wave).curvature, whole.curvature)
+
+
 @pytest.mark.long
 def test_gradient_is_that_of_the_loss(behind_focus):
     star, wave = np.array([1e6, 0.2, 0.1, 3.0, 9.0, 0.1, 0.0]), np.zeros(len(NOLL))
@@ -223,6 +280,19 @@ def test_cells_measure_areas_and_moments(focused):
     assert square == pytest.approx(0.5 * (radius**2 + inner**2), rel=2e-4)
     assert abs(cells.weights @ x) < 1e-4
     assert abs(cells.weights @ y) < 1e-4
+
+
+def test_fine_lattices_find_the_rims_of_coarse_ones():
+    """Every point is as if it were traced: rings, a chord of light between them and a spot."""
+
+    def lit(points):
+        x, y = np.moveaxis(points, -1, 0)
+        radius = np.hypot(x, y)
+        return (radius < 0.93) & (radius > 0.55) & (y > -0.8) & (np.hypot(x - 0.7, y) > 0.04)
+
+    along = np.linspace(-1.0, 1.0, 400)
+    points = np.stack(np.meshgrid(along, along), axis=-1)
+    np.testing.assert_array_equal(lit_lattice(lit, points), lit(points))
 
 
 def test_a_search_neither_starts_nor_steps_where_light_has_no_direction(behind_focus):
