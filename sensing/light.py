@@ -354,6 +354,11 @@ class StarLight:
         """Means of the priors of the shifts, from where the telescope has the rims, shape [n_shift]."""
         return np.concatenate([np.zeros(2 * len(self.rims)), -self.free_rims.values[self.free_rims.free]])
 
+    @property
+    def shift_limit(self) -> np.ndarray:
+        """Largest distances of the shifts from these means, shape [n_shift]: sizes are within what is said of them."""
+        return np.concatenate([np.full(2 * len(self.rims), np.inf), self.free_rims.limits])
+
     def with_free_rims(self, rims: FreeRims, wavelength: float) -> StarLight:
         """Return the light of the telescope with rims where these stand; its middle wavelength [m]."""
         prescribed = self.prescribed or self.telescope

@@ -143,6 +143,7 @@ class StarFitter:
         self._light = light
         self.precision = np.concatenate([terms.precision, light.shift_precision])
         self._mean = np.concatenate([np.zeros(len(terms.precision)), light.shift_mean])
+        self._limits = np.concatenate([np.full(len(terms.precision), np.inf), light.shift_limit])
         n = len(self.precision)
         self._map = np.eye(n)[None] if self._wavefront else np.zeros((1, n, 0))
         self._rays: dict[int, ZernikeRays] = {}
@@ -389,7 +390,9 @@ class StarFitter:
     ) -> Solution:
         """Return the best unknowns from a start; see :func:`~pachon.sensing.solve.solve`."""
         n = self._map.shape[2]
-        group = Group((stamp,), self._map, self.precision[:n], self.instrument.known_seeing, prior_mean=self._mean[:n])
+        known = self.instrument.known_seeing
+        priors = {"prior_mean": self._mean[:n], "limits": self._limits[:n]}
+        group = Group((stamp,), self._map, self.precision[:n], known, **priors)
         start = np.zeros(n) if shared is None else shared
         return solve(group, [star], start, tolerance=tolerance, steps=steps, hopeless=hopeless)
 

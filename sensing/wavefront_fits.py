@@ -200,6 +200,7 @@ class SingleDonuts(WavefrontFit):
             usable.fields / instrument.telescope.field_radius,
             zernikes,
             [star_error.parts for star_error in errors],
+            np.array([star.light.depth > 0.0 for star in usable.stars], dtype=bool),
             partial(air_of_terms, instrument),
             measured_air=instrument.model.air.atmosphere is None,
         )
