@@ -346,6 +346,12 @@ def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> D
         noise[i] = units[i] ** 2 * np.median(star.pixels.variance)
         chi2[i] = (pulls(star.pixels, star.model)[star.pixels.used] ** 2).sum()
         n_pixels[i] = star.pixels.used.sum()
+    rims = {
+        int(i): moved_rims(instrument, fits.solutions[i]) if star.shared_rims is None else list(star.shared_rims)
+        for i, star in zip(usable, fitted.stars, strict=True)
+    }
+    for i, of_star in rims.items():
+        flags[i] |= int(DonutFlag.RIM_MOVED) * any(rim.moved for rim in of_star)
     poor = chi2 > _POOR * n_pixels + _BY_CHANCE * np.sqrt(2.0 * n_pixels)
     width, strength = instrument.seeing.fwhm(values[:, STRENGTH]), values[:, STRENGTH]
     return DonutFit(
@@ -380,6 +386,6 @@ def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> D
         degrees_of_freedom=fitted.degrees_of_freedom,
         projection=observed.projection,
         diffraction=bool(instrument.model.diffraction),
-        rims=rim_table({i: moved_rims(instrument, solution) for i, solution in fits.solutions.items()}),
+        rims=rim_table(rims),
         exposure=None if fitted.exposure is None else fitted.exposure.at(usable, count),
     )
