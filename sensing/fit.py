@@ -202,9 +202,9 @@ def fit_donuts(
             model = replace(model, diffraction=diffraction)
             instrument = replace(instrument, model=model)
         fitted = fitted_stars(instrument, by_rays, progress)
-        terms = fit.refined(instrument, fitted.results)
-        if terms is not None:
-            instrument = Instrument.of(telescope, model, terms)
+        refined = fit.refined(instrument, list(fitted.solutions.values()), fitted.results)
+        if refined is not None:
+            instrument = refined
             fitted = fitted_stars(instrument, {}, None)
     result = _result(instrument, observed, fitted)
     warn_of_other_hole(instrument, fitted.solutions, result)
@@ -351,6 +351,7 @@ def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> D
         for i, star in zip(usable, fitted.stars, strict=True)
     }
     for i, of_star in rims.items():
+        flags[i] &= ~int(DonutFlag.RIM_MOVED)
         flags[i] |= int(DonutFlag.RIM_MOVED) * any(rim.moved for rim in of_star)
     poor = chi2 > _POOR * n_pixels + _BY_CHANCE * np.sqrt(2.0 * n_pixels)
     width, strength = instrument.seeing.fwhm(values[:, STRENGTH]), values[:, STRENGTH]

@@ -95,6 +95,8 @@ class Instrument:
         The long exposure.
     diffusion : float
         Rms of the charge diffusion along each axis [m].
+    free_rims : FreeRims
+        Rims that are free in the fits of all stars, and where these begin.
     """
 
     telescope: Telescope
@@ -105,6 +107,7 @@ class Instrument:
     pixel: float
     seeing: Seeing
     diffusion: float
+    free_rims: FreeRims = field(default_factory=FreeRims)
 
     @classmethod
     def of(cls, telescope: Telescope, model: DonutModel, terms: WavefrontTerms) -> Instrument:
@@ -176,6 +179,8 @@ class Instrument:
             diffracting = pupil_rims(telescope, direction, self.middle, pieces)
         rims = movable_rims(telescope, points, ends)
         light = StarLight(telescope, direction, diameter, depth, jacobian, rims, diffracting)
+        if self.free_rims.bodies:
+            return light.with_free_rims(self.free_rims, self.middle)
         if not self.model.rims.size:
             return light
         free = rims_of_other_size(telescope, direction, self.middle, _FEWEST, self.model.rims.size)

@@ -151,8 +151,8 @@ class WavefrontFit(ABC):
         """Return the stars with flags by the side of focus that they say together, where they are compared."""
         return list(stars)
 
-    def refined(self, instrument: Instrument, fitted: FittedStars) -> WavefrontTerms | None:
-        """Return terms with which all stars are fitted once more, by what a first fit has found; None for no other."""
+    def refined(self, instrument: Instrument, stars: Sequence[StarSolution], fitted: FittedStars) -> Instrument | None:
+        """Return an instrument for which all stars are fitted once more, by what a first fit has found; or None."""
         return None
 
     @abstractmethod
