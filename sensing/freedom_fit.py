@@ -85,45 +85,49 @@ class TelescopeFreedoms(WavefrontFit):
         fields, projection = usable.fields, usable.projection
         last = int(noll.max())
         response = sensitivity(telescope, freedoms, fields, wavelength, n_zernike=last, projection=projection)
-        count, rims = len(freedoms), shared_rims(instrument, usable.stars)
+        count, rims, slopes = len(freedoms), shared_rims(instrument, usable.stars), instrument.slope_spreads
+        first = count + len(slopes)
         shifts = self._rim_shifts(usable, spreads)
-        maps = [block_diag(np.concatenate([np.eye(count), of_star]), np.eye(len(rims))) for of_star in shifts]
+        maps = [
+            block_diag(np.concatenate([np.eye(count), of_star]), np.eye(len(slopes) + len(rims))) for of_star in shifts
+        ]
         shared, unknowns = usable.start(response.matrix[:, noll - 1], spreads**-2.0), usable.unknowns
+        shared = np.append(shared, 0.0 * slopes)
         for _ in range(_OUTER):
             stars = [
-                self._with_vignetting(instrument, star, rims, shared, star_shifts @ shared)
+                self._with_vignetting(instrument, star, rims, shared[:count], star_shifts @ shared[:count])
                 for star, star_shifts in zip(usable.stars, shifts, strict=True)
             ]
             group = Group(
                 tuple(star.stamp for star in stars),
                 maps,
-                np.concatenate([spreads, rims.spreads]) ** -2.0,
+                np.concatenate([spreads, slopes, rims.spreads]) ** -2.0,
                 instrument.known_seeing,
                 transient=True,
-                prior_mean=np.concatenate([np.zeros(count), -rims.values[rims.free]]),
-                limits=np.concatenate([np.full(count, np.inf), rims.limits]),
+                prior_mean=np.concatenate([np.zeros(first), -rims.values[rims.free]]),
+                limits=np.concatenate([np.full(first, np.inf), rims.limits]),
             )
             start = np.concatenate([shared, np.zeros(len(rims))])
             joint = solve(group, unknowns, start, steps=_INNER, pool=pool)
-            change, shared, unknowns = joint.shared - start, joint.shared[:count], list(joint.stars)
+            change, shared, unknowns = joint.shared - start, joint.shared[:first], list(joint.stars)
             if float(change @ np.linalg.solve(joint.shared_covariance, change)) < _SETTLED * len(change):
                 break
-            rims = rims.moved(change[count:])
+            rims = rims.moved(change[first:])
         lacking = by_residuals(instrument, stars, group, joint)
-        after = freedoms.apply(telescope, shared)
+        after = freedoms.apply(telescope, shared[:count])
         believed, estimated = (
             wavefront_zernikes(t, fields, wavelength, jmax=last, projection=projection).coefficients[:, noll - 1]
             for t in (telescope, after)
         )
         many = max(last, _MANY_TERMS)
         response = sensitivity(after, freedoms, fields, wavelength, n_zernike=many, projection=projection)
-        # Rims are no part of the wavefront.
-        zernike_maps = np.pad(response.matrix[:, noll - 1], ((0, 0), (0, 0), (0, len(rims))))
+        # Rims and slopes of the response are no part of the wavefront.
+        zernike_maps = np.pad(response.matrix[:, noll - 1], ((0, 0), (0, 0), (0, len(slopes) + len(rims))))
         covariance = (joint.shared_covariance + lacking.shared_covariance)[:count, :count]
-        moved = moved_rims_of_all(instrument, stars, rims, joint, count)
+        moved = moved_rims_of_all(instrument, stars, rims, joint, first)
         return FittedStars(
-            joint_results(stars, joint, lacking, estimated - believed, list(zernike_maps), moved),
-            degrees_of_freedom=FreedomEstimate(freedoms, shared, covariance, spreads),
+            joint_results(stars, joint, lacking, estimated - believed, list(zernike_maps), moved, slice(count, first)),
+            degrees_of_freedom=FreedomEstimate(freedoms, shared[:count], covariance, spreads),
         )
 
     def _rim_shifts(self, usable: UsableStars, spreads: np.ndarray) -> list[np.ndarray]:
@@ -158,7 +162,8 @@ class TelescopeFreedoms(WavefrontFit):
             outlines = pupil_rims(changed, light.direction, instrument.middle)
             stamp, full = (replace(s, grid=s.grid.with_rims(outlines)) for s in (star.stamp, star.full))
             star = replace(star, stamp=stamp, full=full)
-        held = np.concatenate([shifts, np.zeros(len(rims))])
+        cells = instrument.with_response(light, changed, cells)
+        held = np.concatenate([shifts, np.zeros(len(light.slope_spreads) + len(rims))])
         return self._with_cells(instrument, replace(star, light=light), cells, held)
 
     def _with_cells(

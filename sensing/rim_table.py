@@ -56,7 +56,7 @@ class MovedRim:
 def moved_rims(instrument: Instrument, star: StarSolution) -> list[MovedRim]:
     """Return the rims that are free in the fit of a star."""
     light = star.light
-    first = len(instrument.noll) + 2 * len(light.rims)
+    first = len(instrument.noll) + light.before_free_rims
     free = slice(first, first + len(light.free_rims))
     steps, covariance = star.solution.shared[free], star.solution.shared_covariance[free, free]
     return rims_at(instrument, light, star.stamp, steps, covariance)

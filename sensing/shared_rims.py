@@ -32,7 +32,7 @@ def shared_rims(instrument: Instrument, stars: Sequence[StarSolution]) -> FreeRi
     prior = rims.spreads**-2.0
     curvature, gradient = np.diag(prior), np.zeros(len(rims))
     for star in stars:
-        own, begin = star.light.free_rims, len(instrument.noll) + 2 * len(star.light.rims)
+        own, begin = star.light.free_rims, len(instrument.noll) + star.light.before_free_rims
         free = slice(begin, begin + len(own))
         places = _places(rims, own)
         information = np.linalg.pinv(star.solution.shared_covariance[free, free], hermitian=True)
@@ -71,16 +71,16 @@ def cells_across(instrument: Instrument, star: StarSolution) -> int:
 
 
 def with_shared_rims(instrument: Instrument, star: StarSolution, rims: FreeRims) -> StarSolution:
-    """Return a star for unknowns of the wavefront and the free motions of the rims of all stars.
+    """Return a star for unknowns of the wavefront, slopes of the response and free motions of the rims of all stars.
 
     Other rims stand where the star's own fit has them.
     """
     rays, first = star.stamp.rays, len(instrument.noll)
     assert isinstance(rays, ZernikeRays)
+    held = star.solution.waves[0][first : first + 2 * len(star.light.rims)].copy()
     if not rims.bodies:
-        return replace(star, stamp=replace(star.stamp, rays=rays.holding(star.solution.waves[0][first:])))
+        return replace(star, stamp=replace(star.stamp, rays=rays.holding(held)))
     light = light_with(instrument, star, rims)
-    held = star.solution.waves[0][first : first + 2 * len(light.rims)].copy()
     names = rims.surfaces(light.telescope)
     held[np.repeat(np.array([rim.name in names for rim in light.rims], dtype=bool), 2)] = 0.0
     stamp, full = star.stamp, star.full

@@ -179,7 +179,7 @@ class StarFitter:
         def solved(light: StarLight, start: Solution, hopeless: float = math.inf) -> RimFit:
             fitter = self.with_light(light)
             moved_stamp = stamp_of(fitter)
-            held = len(light.rims) * 2 + len(self.instrument.noll)
+            held = light.before_free_rims + len(self.instrument.noll)
             shared = np.concatenate([start.shared[:held], np.zeros(len(light.free_rims))])
             best = fitter.solve(moved_stamp, start.stars[0], shared, tolerance, hopeless=hopeless)
             return RimFit(light, moved_stamp, best)

@@ -96,7 +96,8 @@ class UsableStars:
 class FittedStar:
     """Result of a star: pixels, best model [electrons], unknowns and their covariance, wavefront [m] and its errors.
 
-    Rims that stand elsewhere are those of the star's own fit, unless it shares them with others.
+    Rims that stand elsewhere, and slopes of the response with their errors [1/pixel], are those of the star's own fit,
+    unless it shares them with others.
     """
 
     pixels: Stamp
@@ -106,6 +107,7 @@ class FittedStar:
     zernikes: np.ndarray
     errors: ErrorParts
     shared_rims: Sequence[MovedRim] | None = None
+    shared_slopes: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -264,9 +266,12 @@ class FieldTerms(WavefrontFit):
                 f"field_noll: {n_field} terms for {len(usable.stars)} usable donuts; expected no more terms"
             )
         over_field = annular_zernikes(int(field_noll.max()), *(usable.fields.T / instrument.telescope.field_radius))
-        maps = np.stack([np.kron(row, np.eye(n_noll)) for row in over_field[field_noll - 1].T])
-        precision, rims = np.tile(instrument.terms.precision, n_field), shared_rims(instrument, usable.stars)
-        shared, unknowns, first = usable.start(maps, precision), usable.unknowns, maps.shape[2]
+        wave_maps = np.stack([np.kron(row, np.eye(n_noll)) for row in over_field[field_noll - 1].T])
+        precision, slopes = np.tile(instrument.terms.precision, n_field), instrument.slope_spreads
+        shared, unknowns = np.append(usable.start(wave_maps, precision), 0.0 * slopes), usable.unknowns
+        maps = [block_diag(of_star, np.eye(len(slopes))) for of_star in wave_maps]
+        precision, first = np.append(precision, slopes**-2.0), len(shared)
+        rims = shared_rims(instrument, usable.stars)
         for _ in range(RIM_STEPS):
             stars = [with_shared_rims(instrument, star, rims) for star in usable.stars]
             group = Group(
@@ -294,6 +299,7 @@ class FieldTerms(WavefrontFit):
                 np.array(solution.waves)[:, :n],
                 [of_star[:n] for of_star in group.maps],
                 moved_rims_of_all(instrument, stars, rims, solution, first),
+                slice(first - len(slopes), first),
             ),
             solution.shared[requested].reshape(-1, n),
             shared_covariance[np.ix_(requested, requested)],
@@ -307,6 +313,7 @@ def joint_results(
     zernikes: np.ndarray,
     zernike_maps: np.ndarray | Sequence[np.ndarray],
     rims: Sequence[list[MovedRim]],
+    slopes: slice,
 ) -> list[FittedStar]:
     """Return the results of stars that share unknowns.
 
@@ -324,8 +331,12 @@ def joint_results(
         Derivatives of the wavefronts with respect to the shared unknowns.
     rims : sequence of n_star list of MovedRim
         Rims that stand elsewhere, as each star shows them; empty without any.
+    slopes : slice
+        Which of the shared unknowns are slopes of the response.
     """
     results = []
+    spread_of_slopes = np.sqrt(np.diag(solution.shared_covariance + lacking.shared_covariance)[slopes])
+    response_slope = np.array([solution.shared[slopes], spread_of_slopes])
     for i, star in enumerate(stars):
         pixels = replace(star.full, rays=star.stamp.rays)
         model = model_image(pixels, solution.stars[i], solution.waves[i])
@@ -338,5 +349,6 @@ def joint_results(
         floor = model_floor(zernikes[i])
         parts = ErrorParts.of(spread, lack, np.zeros_like(spread), floor)
         moved = rims[i] if rims else ()
-        results.append(FittedStar(pixels, model, solution.stars[i], covariance, zernikes[i], parts, moved))
+        unknowns = solution.stars[i]
+        results.append(FittedStar(pixels, model, unknowns, covariance, zernikes[i], parts, moved, response_slope))
     return results
