@@ -358,9 +358,9 @@ def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> D
         n_pixels[i] = star.pixels.used.sum()
     slopes = np.full((2, count, 2), np.nan)
     for i, star in zip(usable, fitted.stars, strict=True):
-        of_star = _response_slopes(instrument, fits.solutions[i]) if star.shared_slopes is None else star.shared_slopes
-        if of_star.size:
-            slopes[:, i] = of_star
+        slope = _response_slopes(instrument, fits.solutions[i]) if star.shared_slopes is None else star.shared_slopes
+        if slope.size:
+            slopes[:, i] = slope
     rims = {
         int(i): moved_rims(instrument, fits.solutions[i]) if star.shared_rims is None else list(star.shared_rims)
         for i, star in zip(usable, fitted.stars, strict=True)

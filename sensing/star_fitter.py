@@ -391,8 +391,8 @@ class StarFitter:
         """Return the best unknowns from a start; see :func:`~pachon.sensing.solve.solve`."""
         n = self._map.shape[2]
         known = self.instrument.known_seeing
-        priors = {"prior_mean": self._mean[:n], "limits": self._limits[:n]}
-        group = Group((stamp,), self._map, self.precision[:n], known, **priors)
+        mean, limits = self._mean[:n], self._limits[:n]
+        group = Group((stamp,), self._map, self.precision[:n], known, prior_mean=mean, limits=limits)
         start = np.zeros(n) if shared is None else shared
         return solve(group, [star], start, tolerance=tolerance, steps=steps, hopeless=hopeless)
 
