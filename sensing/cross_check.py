@@ -20,6 +20,8 @@ _FOR_CONSTANT = 2
 _NEAR = 0.1
 #: Scatter from which on donuts are not of one exposure of one telescope [m]: air of 8 s at the LSST.
 _MOST_SCATTER = 150e-9
+#: Part of unexplained scatter that is where the donuts differ, beside that of the air: it may have another cause.
+_WHERE_SEEN = 0.5
 #: Fraction of the air's variance that stars do not share.
 _AIR_OF_ITS_OWN = 1.0 - GROUND
 #: Standard deviation of the logarithm of the air's variance about that which residuals say.
@@ -34,12 +36,14 @@ def cross_checked(
     fields: np.ndarray,
     zernikes: np.ndarray,
     parts: Sequence[ErrorParts],
+    behind: np.ndarray,
     air: Callable[[], np.ndarray],
     measured_air: bool,
 ) -> list[ErrorParts]:
     """Return the errors of donuts that are fitted each by itself, after a check against their scatter.
 
-    Donuts too far apart, too few, or of wavefronts too different to be of one exposure are left as they are.
+    Donuts too far apart, too few, or of wavefronts too different to be of one exposure are left as they are. Donuts
+    near each other on both sides of focus are of one telescope, however different.
 
     Parameters
     ----------
@@ -49,6 +53,8 @@ def cross_checked(
         Wavefronts [m].
     parts : sequence of n ErrorParts
         Their errors.
+    behind : ndarray of bool, shape [n]
+        Whether the detector is behind focus.
     air : callable
         Covariance of unit trace that unexplained scatter has, [n_noll, n_noll].
     measured_air : bool
@@ -62,13 +68,16 @@ def cross_checked(
     basis = np.linalg.qr(design)[0]
     free = 1.0 - (basis**2).sum(axis=1)
     values = zernikes[group]
-    scatter = float(((values - basis @ (basis.T @ values)) ** 2).sum())
+    of_terms = ((values - basis @ (basis.T @ values)) ** 2).sum(axis=0)
+    scatter = float(of_terms.sum())
+    freedom = count - terms
+    both_sides = terms == 1 and len(set(behind[group])) == 2
+    most = math.inf if both_sides else _MOST_SCATTER**2 * freedom
     noise, lacking, in_air = (
         float(sum(w * np.trace(of(parts[i])) for w, i in zip(free, group, strict=True)))
         for of in (_noise, _lacking, lambda errors: errors.air)
     )
-    freedom = count - terms
-    if measured_air and in_air > 0.0 and scatter < _MOST_SCATTER**2 * freedom + noise + lacking:
+    if measured_air and in_air > 0.0 and scatter < most + noise + lacking:
         others = noise + lacking - in_air
         # What donuts share of the air is no part of the scatter.
         scale = _scale_of_air(scatter, others, _AIR_OF_ITS_OWN * in_air, _INDEPENDENT * freedom)
@@ -79,10 +88,10 @@ def cross_checked(
         ]
         lacking = others - noise + scale * _AIR_OF_ITS_OWN * in_air
     excess = scatter - noise - lacking
-    if excess > _MOST_SCATTER**2 * freedom:
+    if excess > most:
         return list(parts)
     if excess > _SIGNIFICANT * (noise + lacking) * np.sqrt(2.0 / (freedom * _INDEPENDENT)):
-        added = excess / freedom * air()
+        added = excess / freedom * ((1.0 - _WHERE_SEEN) * air() + _WHERE_SEEN * np.diag(of_terms / scatter))
         return [_with_repeats(replace(errors, floor=errors.floor + added)) for errors in checked]
     share = min(max(scatter - noise, 0.0) / lacking, 1.0) if lacking > 0.0 else 1.0
     for i in group:

@@ -232,10 +232,10 @@ class ZernikeRays:
         """Return fractions of the light; see :class:`LightRays`."""
         return self._weights + self.rates @ unknowns[len(self._gradients) :]
 
-    def at_shifts(self, unknowns: np.ndarray) -> ZernikeRays:
-        """Return the light with its rims held where unknowns have them, for unknowns of the wavefront alone."""
-        held = copy(self)
-        held._weights, held.rates = self.weights(unknowns), self.rates[:, :0]
+    def holding(self, shifts: np.ndarray) -> ZernikeRays:
+        """Return the light with its first rims held at shifts [m], for unknowns of the wavefront and other rims."""
+        held, count = copy(self), len(shifts)
+        held._weights, held.rates = self._weights + self.rates[:, :count] @ shifts, self.rates[:, count:]
         return held
 
     def landing(self, unknowns: np.ndarray) -> np.ndarray:

@@ -29,8 +29,11 @@ from .hierarchy import Basis, Hierarchy, Observations, fit_hierarchy, star_numbe
 from .image_model import STRENGTH
 from .inputs import noll_indices, small_length
 from .light import Instrument
+from .moving_rims import FreeRims
+from .shared_rims import shared_rims
 from .sides import SideAgreement, SideFit, decide_sides, pair_agreement
 from .star_errors import StarErrors, star_errors
+from .star_fitter import StarSolution
 from .terms import WavefrontTerms
 from .wavefront_fits import NOLL, FittedStar, FittedStars, UsableStars, WavefrontFit
 
@@ -105,7 +108,19 @@ class ExposureDonuts(WavefrontFit):
         # The air's part is shared, and is added to the errors of all stars together.
         return replace(terms, air=np.zeros_like(terms.air))
 
-    def refined(self, instrument: Instrument, fitted: FittedStars) -> WavefrontTerms | None:
+    def refined(self, instrument: Instrument, stars: Sequence[StarSolution], fitted: FittedStars) -> Instrument | None:
+        """Return terms with the higher ones of the air, if there is some, and rims that stand elsewhere for any star.
+
+        Such a rim is then free for all stars, where they have it together.
+        """
+        terms, rims = self._terms_with_air(instrument, fitted), FreeRims()
+        if any(body.moved for star in stars for body in star.light.free_rims.bodies):
+            rims = shared_rims(instrument, stars)
+        if terms is None and not rims.bodies:
+            return None
+        return replace(instrument, terms=terms or instrument.terms, free_rims=rims)
+
+    def _terms_with_air(self, instrument: Instrument, fitted: FittedStars) -> WavefrontTerms | None:
         """Return terms with the higher ones of the air where the scatter of the stars says that there is some."""
         exposure, known = fitted.exposure, instrument.model.air.atmosphere is not None
         if known or exposure is None or exposure.air_rms < _SLIGHT_AIR:

@@ -202,9 +202,9 @@ def fit_donuts(
             model = replace(model, diffraction=diffraction)
             instrument = replace(instrument, model=model)
         fitted = fitted_stars(instrument, by_rays, progress)
-        terms = fit.refined(instrument, fitted.results)
-        if terms is not None:
-            instrument = Instrument.of(telescope, model, terms)
+        refined = fit.refined(instrument, list(fitted.solutions.values()), fitted.results)
+        if refined is not None:
+            instrument = refined
             fitted = fitted_stars(instrument, {}, None)
     result = _result(instrument, observed, fitted)
     warn_of_other_hole(instrument, fitted.solutions, result)
@@ -320,6 +320,16 @@ def _saturated(image: np.ndarray, masked: np.ndarray, level: float | None) -> np
     return plateau if top > _FAINT and plateau.sum() > max(_SEVERAL * image.size, 1.0) else np.zeros_like(masked)
 
 
+def _response_slopes(instrument: Instrument, star: StarSolution) -> np.ndarray:
+    """Return slopes of the response along x and y and their errors, by the fit of a star alone, [2, 0] or [2, 2]."""
+    last = len(instrument.noll) + star.light.before_free_rims
+    slopes = slice(last - len(star.light.slope_spreads), last)
+    if not len(star.solution.shared):
+        return np.zeros((2, 0))
+    errors = np.sqrt(np.diag(star.solution.shared_covariance)[slopes])
+    return np.array([star.solution.shared[slopes], errors])
+
+
 def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> DonutFit:
     """Return the result of a fit: rows of the usable stars, and NaN for the others."""
     fitted, usable = fits.results, np.array(list(fits.solutions), dtype=np.int64)
@@ -346,6 +356,18 @@ def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> D
         noise[i] = units[i] ** 2 * np.median(star.pixels.variance)
         chi2[i] = (pulls(star.pixels, star.model)[star.pixels.used] ** 2).sum()
         n_pixels[i] = star.pixels.used.sum()
+    slopes = np.full((2, count, 2), np.nan)
+    for i, star in zip(usable, fitted.stars, strict=True):
+        slope = _response_slopes(instrument, fits.solutions[i]) if star.shared_slopes is None else star.shared_slopes
+        if slope.size:
+            slopes[:, i] = slope
+    rims = {
+        int(i): moved_rims(instrument, fits.solutions[i]) if star.shared_rims is None else list(star.shared_rims)
+        for i, star in zip(usable, fitted.stars, strict=True)
+    }
+    for i, of_star in rims.items():
+        flags[i] &= ~int(DonutFlag.RIM_MOVED)
+        flags[i] |= int(DonutFlag.RIM_MOVED) * any(rim.moved for rim in of_star)
     poor = chi2 > _POOR * n_pixels + _BY_CHANCE * np.sqrt(2.0 * n_pixels)
     width, strength = instrument.seeing.fwhm(values[:, STRENGTH]), values[:, STRENGTH]
     return DonutFit(
@@ -359,6 +381,8 @@ def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> D
         center_error=errors[:, [X, Y]],
         background=values[:, BACKGROUND],
         background_slope=values[:, [SLOPE_X, SLOPE_Y]],
+        response_slope=slopes[0],
+        response_slope_error=slopes[1],
         fwhm=width,
         fwhm_error=width * errors[:, STRENGTH] / np.where(strength > 0.0, strength, 1.0),
         chi2=chi2,
@@ -380,6 +404,6 @@ def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> D
         degrees_of_freedom=fitted.degrees_of_freedom,
         projection=observed.projection,
         diffraction=bool(instrument.model.diffraction),
-        rims=rim_table({i: moved_rims(instrument, solution) for i, solution in fits.solutions.items()}),
+        rims=rim_table(rims),
         exposure=None if fitted.exposure is None else fitted.exposure.at(usable, count),
     )

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 
 from ..core.arguments import check_arguments
 from ..design.metrics.field_zernikes import wavefront_zernikes
@@ -19,12 +20,12 @@ from ..raytrace.launch import aimed_points
 from ..wavefront.psf.pupil_rims import pupil_rims
 from .degrees import FreedomEstimate, FreedomRays, prior_spreads
 from .fit_star import StarFit
-from .image_model import STRENGTH
 from .inputs import noll_indices
 from .light import Instrument
+from .moving_rims import FreeRims
 from .pupil_cells import PupilCells
+from .shared_rims import cells_across, light_with, moved_rims_of_all, shared_rims
 from .solve import Group, solve
-from .stamps import Pixels
 from .star_errors import by_residuals
 from .star_fitter import StarSolution
 from .vignetting import cells_with_rims, rim_shifts
@@ -84,34 +85,49 @@ class TelescopeFreedoms(WavefrontFit):
         fields, projection = usable.fields, usable.projection
         last = int(noll.max())
         response = sensitivity(telescope, freedoms, fields, wavelength, n_zernike=last, projection=projection)
-        precision = spreads**-2.0
+        count, rims, slopes = len(freedoms), shared_rims(instrument, usable.stars), instrument.slope_spreads
+        first = count + len(slopes)
         shifts = self._rim_shifts(usable, spreads)
-        maps = [np.concatenate([np.eye(len(freedoms)), star_shifts]) for star_shifts in shifts]
-        shared, unknowns = usable.start(response.matrix[:, noll - 1], precision), usable.unknowns
+        maps = [
+            block_diag(np.concatenate([np.eye(count), of_star]), np.eye(len(slopes) + len(rims))) for of_star in shifts
+        ]
+        shared, unknowns = usable.start(response.matrix[:, noll - 1], spreads**-2.0), usable.unknowns
+        shared = np.append(shared, 0.0 * slopes)
         for _ in range(_OUTER):
             stars = [
-                self._with_vignetting(instrument, star, shared, star_shifts @ shared)
+                self._with_vignetting(instrument, star, rims, shared[:count], star_shifts @ shared[:count])
                 for star, star_shifts in zip(usable.stars, shifts, strict=True)
             ]
-            stamps = tuple(star.stamp for star in stars)
-            group = Group(stamps, maps, precision, instrument.known_seeing, transient=True)
-            joint = solve(group, unknowns, shared, steps=_INNER, pool=pool)
-            change, shared, unknowns = joint.shared - shared, joint.shared, list(joint.stars)
+            group = Group(
+                tuple(star.stamp for star in stars),
+                maps,
+                np.concatenate([spreads, slopes, rims.spreads]) ** -2.0,
+                instrument.known_seeing,
+                transient=True,
+                prior_mean=np.concatenate([np.zeros(first), -rims.values[rims.free]]),
+                limits=np.concatenate([np.full(first, np.inf), rims.limits]),
+            )
+            start = np.concatenate([shared, np.zeros(len(rims))])
+            joint = solve(group, unknowns, start, steps=_INNER, pool=pool)
+            change, shared, unknowns = joint.shared - start, joint.shared[:first], list(joint.stars)
             if float(change @ np.linalg.solve(joint.shared_covariance, change)) < _SETTLED * len(change):
                 break
+            rims = rims.moved(change[first:])
         lacking = by_residuals(instrument, stars, group, joint)
-        after = freedoms.apply(telescope, joint.shared)
+        after = freedoms.apply(telescope, shared[:count])
         believed, estimated = (
             wavefront_zernikes(t, fields, wavelength, jmax=last, projection=projection).coefficients[:, noll - 1]
             for t in (telescope, after)
         )
         many = max(last, _MANY_TERMS)
         response = sensitivity(after, freedoms, fields, wavelength, n_zernike=many, projection=projection)
+        # Rims and slopes of the response are no part of the wavefront.
+        zernike_maps = np.pad(response.matrix[:, noll - 1], ((0, 0), (0, 0), (0, len(slopes) + len(rims))))
+        covariance = (joint.shared_covariance + lacking.shared_covariance)[:count, :count]
+        moved = moved_rims_of_all(instrument, stars, rims, joint, first)
         return FittedStars(
-            joint_results(stars, joint, lacking, estimated - believed, response.matrix[:, noll - 1]),
-            degrees_of_freedom=FreedomEstimate(
-                freedoms, joint.shared, joint.shared_covariance + lacking.shared_covariance, spreads
-            ),
+            joint_results(stars, joint, lacking, estimated - believed, list(zernike_maps), moved, slice(count, first)),
+            degrees_of_freedom=FreedomEstimate(freedoms, shared[:count], covariance, spreads),
         )
 
     def _rim_shifts(self, usable: UsableStars, spreads: np.ndarray) -> list[np.ndarray]:
@@ -132,20 +148,23 @@ class TelescopeFreedoms(WavefrontFit):
         return np.split(shifts, ends[:-1])
 
     def _with_vignetting(
-        self, instrument: Instrument, star: StarSolution, at: np.ndarray, shifts: np.ndarray
+        self, instrument: Instrument, star: StarSolution, rims: FreeRims, at: np.ndarray, shifts: np.ndarray
     ) -> StarSolution:
-        """Return a star with the vignetting of some values of the degrees of freedom, which shift its rims so far."""
-        light, stamp = star.light, star.stamp
-        fwhm = float(instrument.seeing.fwhm(star.solution.stars[0][STRENGTH]))
-        pixels = Pixels(stamp.image, stamp.variance, stamp.used, round(stamp.grid.scale))
-        across = instrument.sampling(light, pixels, fwhm).across
+        """Return a star with the vignetting of some values of the degrees of freedom, which shift its rims so far.
+
+        Rims that are free stand where those of all stars do.
+        """
+        light = light_with(instrument, star, rims)
         changed = self.freedoms.apply(light.telescope, at)
-        cells = cells_with_rims(changed, light.direction, instrument.middle, across, light.rims)
-        if light.rims and light.pupil_rims is not None:
-            rims = pupil_rims(changed, light.direction, instrument.middle)
-            stamp, full = (replace(s, grid=s.grid.with_rims(rims)) for s in (star.stamp, star.full))
+        across = cells_across(instrument, star)
+        cells = cells_with_rims(changed, light.direction, instrument.middle, across, light.rims, rims)
+        if (light.rims or rims.bodies) and light.pupil_rims is not None:
+            outlines = pupil_rims(changed, light.direction, instrument.middle)
+            stamp, full = (replace(s, grid=s.grid.with_rims(outlines)) for s in (star.stamp, star.full))
             star = replace(star, stamp=stamp, full=full)
-        return self._with_cells(instrument, star, cells, shifts)
+        cells = instrument.with_response(light, changed, cells)
+        held = np.concatenate([shifts, np.zeros(len(light.slope_spreads) + len(rims))])
+        return self._with_cells(instrument, replace(star, light=light), cells, held)
 
     def _with_cells(
         self, instrument: Instrument, star: StarSolution, cells: PupilCells, shifts: np.ndarray | None = None

@@ -22,6 +22,7 @@ from .likelihood import Stamp
 from .model import DonutModel
 from .moving_rims import FreeRims, rims_of_other_size
 from .pupil_cells import PupilCells
+from .response_slope import cells_with_response
 from .rim_outlines import concentric
 from .seeing import Seeing
 from .stamps import Pixels
@@ -99,6 +100,8 @@ class Instrument:
         The long exposure.
     diffusion : float
         Rms of the charge diffusion along each axis [m].
+    free_rims : FreeRims
+        Rims that are free in the fits of all stars, and where these begin.
     """
 
     telescope: Telescope
@@ -109,6 +112,7 @@ class Instrument:
     pixel: float
     seeing: Seeing
     diffusion: float
+    free_rims: FreeRims = field(default_factory=FreeRims)
 
     @classmethod
     def of(cls, telescope: Telescope, model: DonutModel, terms: WavefrontTerms) -> Instrument:
@@ -131,6 +135,12 @@ class Instrument:
     def known_seeing(self) -> bool:
         """Whether the strengths of the turbulence are held."""
         return self.model.air.fwhm is not None
+
+    @property
+    def slope_spreads(self) -> np.ndarray:
+        """Standard deviations of the slopes of the response along x and y [1/pixel], if these are unknown."""
+        spread = self.model.detector.response_slope
+        return np.full(2, spread) if spread else np.zeros(0)
 
     @property
     def middle(self) -> float:
@@ -179,7 +189,11 @@ class Instrument:
             pieces = diffracting_pieces(diameter / self.pixel)
             diffracting = pupil_rims(telescope, direction, self.middle, pieces)
         rims = movable_rims(telescope, points, ends)
-        light = StarLight(telescope, direction, diameter, depth, jacobian, rims, diffracting)
+        light = StarLight(
+            telescope, direction, diameter, depth, jacobian, rims, diffracting, slope_spreads=self.slope_spreads
+        )
+        if self.free_rims.bodies:
+            return light.with_free_rims(self.free_rims, self.middle)
         if not self.model.rims.size:
             return light
         free = rims_of_other_size(telescope, direction, self.middle, _FEWEST, self.model.rims.size)
@@ -258,7 +272,13 @@ class Instrument:
     def rays(self, light: StarLight, across: int) -> ZernikeRays:
         """Return the light of a star through so many cells across the pupil."""
         cells = cells_with_rims(light.telescope, light.direction, self.middle, across, light.rims, light.free_rims)
-        return self.rays_of(light, cells)
+        return self.rays_of(light, self.with_response(light, light.telescope, cells))
+
+    def with_response(self, light: StarLight, telescope: Telescope, cells: PupilCells) -> PupilCells:
+        """Return the cells of a star's light through a telescope with slopes of the response, if these are unknown."""
+        if not len(light.slope_spreads):
+            return cells
+        return cells_with_response(telescope, light.direction, self.middle, cells, self.pixel, 2 * len(light.rims))
 
     def rays_of(self, light: StarLight, cells: PupilCells) -> ZernikeRays:
         """Return the light of a star through given cells of the pupil."""
@@ -334,6 +354,8 @@ class StarLight:
         Rims that are free beside these, and where the telescope has them.
     prescribed : Telescope or None
         The telescope with these where the prescription has them; None where none is free.
+    slope_spreads : ndarray, shape [0] or [2]
+        Standard deviations of the slopes of the response along x and y [1/pixel], if these are unknown.
     """
 
     telescope: Telescope
@@ -345,20 +367,31 @@ class StarLight:
     pupil_rims: PupilRims | None = None
     free_rims: FreeRims = field(default_factory=FreeRims)
     prescribed: Telescope | None = None
+    slope_spreads: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def before_free_rims(self) -> int:
+        """Number of unknowns of the light before the motions of free rims: shifts of others, slopes of the response."""
+        return 2 * len(self.rims) + len(self.slope_spreads)
 
     @property
     def shift_precision(self) -> np.ndarray:
-        """Inverse variances of the shifts of the rims along x and y and of the motions of free ones, [n_shift]."""
+        """Inverse variances of shifts of rims, slopes of the response and motions of free rims, shape [n_shift]."""
         names = self.free_rims.surfaces(self.telescope)
         # A rim that is free by itself has no further shift.
         spreads = [shift_spread(self.telescope) * (_HELD if rim.name in names else 1.0) for rim in self.rims]
         shifts = np.repeat(spreads, 2) ** -2.0
-        return np.concatenate([shifts, self.free_rims.spreads**-2.0])
+        return np.concatenate([shifts, self.slope_spreads**-2.0, self.free_rims.spreads**-2.0])
 
     @property
     def shift_mean(self) -> np.ndarray:
         """Means of the priors of the shifts, from where the telescope has the rims, shape [n_shift]."""
-        return np.concatenate([np.zeros(2 * len(self.rims)), -self.free_rims.values[self.free_rims.free]])
+        return np.concatenate([np.zeros(self.before_free_rims), -self.free_rims.values[self.free_rims.free]])
+
+    @property
+    def shift_limit(self) -> np.ndarray:
+        """Largest distances of the shifts from these means, shape [n_shift]: sizes are within what is said of them."""
+        return np.concatenate([np.full(self.before_free_rims, np.inf), self.free_rims.limits])
 
     def with_free_rims(self, rims: FreeRims, wavelength: float) -> StarLight:
         """Return the light of the telescope with rims where these stand; its middle wavelength [m]."""

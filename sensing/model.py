@@ -27,6 +27,8 @@ _MOST_FWHM = 60.0 * ARCSEC
 _PIXEL_SIDES = (1e-6, 1e-2)
 #: Largest defocus of an image [m].
 _MOST_DEFOCUS = 0.1
+#: Largest standard deviation of the slope of the response, relative, a pixel.
+_MOST_SLOPE = 1e-2
 #: Largest relative standard deviation of the radii of rims.
 _MOST_SIZE = 0.1
 #: Least number of cells across the pupil that make an image of it.
@@ -112,6 +114,10 @@ class DonutDetector:
     saturation : float, optional
         Level from which on pixels are saturated [electrons]. Many pixels of the same greatest value are taken to be
         saturated without it.
+    response_slope : float
+        Standard deviation of a slope of the detector's response along each axis, which flat fields have not taken out,
+        relative, a pixel: 5e-5 is 1 % across 200 pixels. It is fitted, by fits of field terms or degrees of freedom for
+        all donuts together: one alone hardly tells it from coma.
 
     Raises
     ------
@@ -125,6 +131,7 @@ class DonutDetector:
     defocus: ArrayLike = 0.0
     moved: str = DETECTOR
     saturation: float | None = None
+    response_slope: float = 0.0
 
     def __post_init__(self) -> None:
         self.pixel()
@@ -133,6 +140,8 @@ class DonutDetector:
             raise DomainError(f"defocus: expected at most {_MOST_DEFOCUS:g} m on either side")
         if self.saturation is not None:
             require_positive(self.saturation, "saturation", "electrons")
+        if not 0.0 <= self.response_slope <= _MOST_SLOPE:
+            raise DomainError(f"response_slope = {shown(self.response_slope)}: expected 0 to {_MOST_SLOPE:g} a pixel")
 
     def pixel(self) -> float:
         """Return the side of a pixel [m]."""

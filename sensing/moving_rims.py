@@ -115,6 +115,12 @@ class FreeRims:
         """Standard deviations of the free motions, shape [n]."""
         return np.array([body.spreads for body in self.bodies]).reshape(-1, MOTIONS)[self.free]
 
+    @property
+    def limits(self) -> np.ndarray:
+        """Largest free motions from the prescription, shape [n]: residuals of other causes would move sizes far."""
+        limits = [np.where(body.moved, np.inf, _MOST * np.array(body.spreads)) for body in self.bodies]
+        return np.array(limits).reshape(-1, MOTIONS)[self.free]
+
     def surfaces(self, telescope: Telescope) -> set[str]:
         """Return the names of the surfaces whose rims are free."""
         return {telescope.surface_names[surface] for body in self.bodies for surface, _ in body.members}

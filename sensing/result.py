@@ -91,6 +91,8 @@ class DonutFit(Result):
         Background at the centre of the stamp [electrons a pixel].
     background_slope : ndarray, shape [n, 2]
         Slopes of the background along x and y [electrons a pixel, per pixel].
+    response_slope, response_slope_error : ndarray, shape [n, 2]
+        Slopes of the detector's response along x and y, relative, a pixel; NaN where they are not fitted.
     fwhm, fwhm_error : ndarray, shape [n]
         Full width at half maximum of the long exposure [rad]; of zero error where it was given.
     chi2 : ndarray, shape [n]
@@ -146,6 +148,8 @@ class DonutFit(Result):
     center_error: np.ndarray
     background: np.ndarray
     background_slope: np.ndarray
+    response_slope: np.ndarray
+    response_slope_error: np.ndarray
     fwhm: np.ndarray
     fwhm_error: np.ndarray
     chi2: np.ndarray
@@ -303,6 +307,7 @@ class DonutFit(Result):
             "chi2": self.chi2,
             "n_pixels": self.n_pixels,
             "background_slope_electrons": self.background_slope,
+            "response_slope": self.response_slope,
             "companions": self.companions,
             "moved_rims": [
                 {"donut": int(row["donut"]), "rim": str(row["rim"])}

@@ -235,7 +235,7 @@ def _settled(
 
     Steps end where the loss cannot get below a `hopeless` one.
     """
-    first = len(instrument.noll) + 2 * len(best.light.rims)
+    first = len(instrument.noll) + best.light.before_free_rims
     factor = 1.0
     for _ in range(steps):
         rims, shift = best.light.free_rims, factor * best.solution.waves[0][first:]

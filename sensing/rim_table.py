@@ -9,7 +9,8 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 
-from .light import Instrument
+from .light import Instrument, StarLight
+from .likelihood import Stamp
 from .moving_rims import PupilShadows, RimBody, RimLines
 from .rim_outlines import MOTIONS, RimMotion
 from .star_fitter import StarSolution
@@ -40,6 +41,8 @@ class MovedRim:
         Mean shift across the rim on its surface towards more light, and its standard deviation [m].
     pixels : tuple of float
         Root mean square shift of the image of the rim across itself, and its standard deviation [pixels].
+    moved : bool
+        Whether it may stand elsewhere, and does not only have another size.
     """
 
     name: str
@@ -47,32 +50,54 @@ class MovedRim:
     errors: np.ndarray
     outward: tuple[float, float]
     pixels: tuple[float, float]
+    moved: bool
 
 
 def moved_rims(instrument: Instrument, star: StarSolution) -> list[MovedRim]:
     """Return the rims that are free in the fit of a star."""
-    light, rims = star.light, star.light.free_rims
+    light = star.light
+    first = len(instrument.noll) + light.before_free_rims
+    free = slice(first, first + len(light.free_rims))
+    steps, covariance = star.solution.shared[free], star.solution.shared_covariance[free, free]
+    return rims_at(instrument, light, star.stamp, steps, covariance)
+
+
+def rims_at(
+    instrument: Instrument, light: StarLight, stamp: Stamp, steps: np.ndarray, step_covariance: np.ndarray
+) -> list[MovedRim]:
+    """Return the free rims of the light of a star after steps of their free motions, with their covariance.
+
+    Those that do not bound the light are left out.
+    """
+    rims = light.free_rims
     if not rims.bodies:
         return []
-    first = len(instrument.noll) + 2 * len(light.rims)
     values, free = rims.values.copy(), rims.free
-    values[free] += star.solution.shared[first : first + len(rims)]
+    values[free] += steps
     covariance = np.zeros((values.size, values.size))
     places = np.flatnonzero(free.ravel())
-    covariance[np.ix_(places, places)] = star.solution.shared_covariance[first:, first:][: len(rims), : len(rims)]
-    cells = star.stamp.rays.cells
+    covariance[np.ix_(places, places)] = step_covariance
+    cells = stamp.rays.cells
     lines = PupilShadows(light.telescope, light.direction, instrument.middle, cells).lines(rims.bodies)
-    pixels = np.sqrt(abs(float(np.linalg.det(star.stamp.grid.footprint)))) / cells.side / instrument.pixel
+    pixels = np.sqrt(abs(float(np.linalg.det(stamp.grid.footprint)))) / cells.side / instrument.pixel
     moved = []
     for k, body in enumerate(rims.bodies):
+        if not (lines.body == k).any():
+            continue
         block = slice(MOTIONS * k, MOTIONS * (k + 1))
         name = _name(light.telescope.surface_names, body)
-        moved.append(_moved_rim(name, values[k], covariance[block, block], lines, k, pixels))
+        moved.append(_moved_rim(name, body, values[k], covariance[block, block], lines, k, pixels))
     return moved
 
 
 def _moved_rim(
-    name: str, values: np.ndarray, covariance: np.ndarray, lines: RimLines, number: int, pixels: float
+    name: str,
+    body: RimBody,
+    values: np.ndarray,
+    covariance: np.ndarray,
+    lines: RimLines,
+    number: int,
+    pixels: float,
 ) -> MovedRim:
     """Return a rim by its motions and their covariance; ``pixels`` are those of a metre of the pupil."""
     pieces = lines.body == number
@@ -88,6 +113,7 @@ def _moved_rim(
         np.sqrt(np.diag(covariance)),
         (mean, float(np.sqrt(across @ covariance @ across))),
         (float(np.copysign(size, mean)), float(np.sqrt(slope @ covariance @ slope))),
+        body.moved,
     )
 
 

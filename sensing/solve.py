@@ -54,6 +54,8 @@ class Group:
         hardly grows with the number of stars.
     prior_mean : ndarray, shape [n_shared], optional
         Means of the priors; zero by default.
+    limits : ndarray, shape [n_shared], optional
+        Largest distances of the shared unknowns from these means; infinite by default.
     """
 
     stamps: tuple[Stamp, ...]
@@ -62,6 +64,14 @@ class Group:
     fixed_strength: bool = False
     transient: bool = False
     prior_mean: np.ndarray | None = None
+    limits: np.ndarray | None = None
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest values of the shared unknowns, each of shape [n_shared]."""
+        mean = np.zeros(len(self.precision)) if self.prior_mean is None else self.prior_mean
+        limits = np.inf if self.limits is None else self.limits
+        return mean - limits, mean + limits
 
 
 @dataclass(frozen=True)
@@ -130,14 +140,14 @@ def solve(
     damping, converged, predicted = _DAMPING, False, np.inf
     for count in range(steps if np.isfinite(state.loss) else 0):
         step = np.zeros_like(joined)
-        free = ~held & ~_pressed(joined, state.gradient, sizes)
+        free = ~held & ~_pressed(group, joined, state.gradient, sizes)
         curvature = state.curvature[np.ix_(free, free)]
         scale = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
         normalized = curvature / np.outer(scale, scale)
         normalized[np.diag_indices_from(normalized)] = 1.0 + damping
         step[free] = _solved(normalized, state.gradient[free] / scale) / scale
         predicted = float(state.gradient @ step)
-        trial = _bounded(after_step(joined, step, sizes), sizes, held)
+        trial = _bounded(group, after_step(joined, step, sizes), sizes, held)
         if predicted < tolerance * max(1.0, state.loss / pixels):
             joined, converged = trial, True
             break
@@ -226,12 +236,16 @@ def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executo
     return _Linearized(curvature, gradient, np.array([e.chi2 for e in star_equations]), loss)
 
 
-def _pressed(joined: np.ndarray, gradient: np.ndarray, sizes: list[int]) -> np.ndarray:
-    """Return which unknowns stand at their least value and would fall: turbulence of images without any, shape [n]."""
+def _pressed(group: Group, joined: np.ndarray, gradient: np.ndarray, sizes: list[int]) -> np.ndarray:
+    """Return which unknowns stand at a bound and would pass it, turbulence of images without any among them, [n]."""
     pressed = np.zeros(len(joined), dtype=bool)
     for first in np.cumsum([0, *sizes[:-1]]):
         at = first + STRENGTH
         pressed[at] = joined[at] <= _LEAST_STRENGTH and gradient[at] < 0.0
+    shared, (least, most) = slice(sum(sizes), None), group.bounds
+    pressed[shared] = ((joined[shared] <= least) & (gradient[shared] < 0.0)) | (
+        (joined[shared] >= most) & (gradient[shared] > 0.0)
+    )
     return pressed
 
 
@@ -249,8 +263,9 @@ def after_step(joined: np.ndarray, step: np.ndarray, sizes: list[int]) -> np.nda
     return moved
 
 
-def _bounded(joined: np.ndarray, sizes: list[int], held: np.ndarray) -> np.ndarray:
-    """Return unknowns with positive fluxes and turbulence."""
+def _bounded(group: Group, joined: np.ndarray, sizes: list[int], held: np.ndarray) -> np.ndarray:
+    """Return unknowns with positive fluxes and turbulence, and shared ones within their bounds."""
+    joined[sum(sizes) :] = np.clip(joined[sum(sizes) :], *group.bounds)
     starts = np.cumsum([0, *sizes[:-1]])
     for first, size in zip(starts, sizes, strict=True):
         joined[first + FLUX] = max(joined[first + FLUX], 1e-3)

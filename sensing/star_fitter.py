@@ -145,6 +145,7 @@ class StarFitter:
         self._light = light
         self.precision = np.concatenate([terms.precision, light.shift_precision])
         self._mean = np.concatenate([np.zeros(len(terms.precision)), light.shift_mean])
+        self._limits = np.concatenate([np.full(len(terms.precision), np.inf), light.shift_limit])
         n = len(self.precision)
         self._map = np.eye(n)[None] if self._wavefront else np.zeros((1, n, 0))
         self._rays: dict[int, ZernikeRays] = {}
@@ -180,7 +181,7 @@ class StarFitter:
         def solved(light: StarLight, start: Solution, hopeless: float = math.inf) -> RimFit:
             fitter = self.with_light(light)
             moved_stamp = stamp_of(fitter)
-            held = len(light.rims) * 2 + len(self.instrument.noll)
+            held = light.before_free_rims + len(self.instrument.noll)
             shared = np.concatenate([start.shared[:held], np.zeros(len(light.free_rims))])
             best = fitter.solve(moved_stamp, start.stars[0], shared, tolerance, hopeless=hopeless)
             return RimFit(light, moved_stamp, best)
@@ -395,7 +396,9 @@ class StarFitter:
     ) -> Solution:
         """Return the best unknowns from a start; see :func:`~pachon.sensing.solve.solve`."""
         n = self._map.shape[2]
-        group = Group((stamp,), self._map, self.precision[:n], self.instrument.known_seeing, prior_mean=self._mean[:n])
+        known = self.instrument.known_seeing
+        mean, limits = self._mean[:n], self._limits[:n]
+        group = Group((stamp,), self._map, self.precision[:n], known, prior_mean=mean, limits=limits)
         start = np.zeros(n) if shared is None else shared
         return solve(group, [star], start, tolerance=tolerance, steps=steps, hopeless=hopeless)
 

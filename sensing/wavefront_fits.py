@@ -11,6 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError
@@ -20,12 +21,13 @@ from ..raytrace.rays import Projection
 from ..wavefront.atmosphere.atmosphere import Atmosphere
 from .cross_check import cross_checked
 from .degrees import FreedomEstimate
-from .donut_rays import ZernikeRays
 from .exposure import ExposureWavefront
 from .fit_star import StarFit
 from .inputs import noll_indices, small_length
 from .light import Instrument
 from .likelihood import Stamp, model_image
+from .rim_table import MovedRim
+from .shared_rims import moved_rims_of_all, settled, shared_rims, with_shared_rims
 from .solve import Group, Solution, solve
 from .star_errors import ErrorParts, air_of_terms, by_residuals, model_floor, star_errors, with_errors
 from .star_fitter import StarSolution
@@ -33,6 +35,8 @@ from .terms import WavefrontTerms
 
 #: Noll indices of the wavefront that are fitted by default: up to the fifth radial degree.
 NOLL = tuple(range(4, 23))
+#: Times that the shadows of rims that all stars share are computed where these are found to stand.
+RIM_STEPS = 6
 
 
 @dataclass(frozen=True)
@@ -90,7 +94,11 @@ class UsableStars:
 
 @dataclass(frozen=True)
 class FittedStar:
-    """Result of a star: pixels, best model [electrons], unknowns and their covariance, wavefront [m] and its errors."""
+    """Result of a star: pixels, best model [electrons], unknowns and their covariance, wavefront [m] and its errors.
+
+    Rims that stand elsewhere, and slopes of the response with their errors [1/pixel], are those of the star's own fit,
+    unless it shares them with others.
+    """
 
     pixels: Stamp
     model: np.ndarray
@@ -98,6 +106,8 @@ class FittedStar:
     covariance: np.ndarray
     zernikes: np.ndarray
     errors: ErrorParts
+    shared_rims: Sequence[MovedRim] | None = None
+    shared_slopes: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -143,8 +153,8 @@ class WavefrontFit(ABC):
         """Return the stars with flags by the side of focus that they say together, where they are compared."""
         return list(stars)
 
-    def refined(self, instrument: Instrument, fitted: FittedStars) -> WavefrontTerms | None:
-        """Return terms with which all stars are fitted once more, by what a first fit has found; None for no other."""
+    def refined(self, instrument: Instrument, stars: Sequence[StarSolution], fitted: FittedStars) -> Instrument | None:
+        """Return an instrument for which all stars are fitted once more, by what a first fit has found; or None."""
         return None
 
     @abstractmethod
@@ -200,6 +210,7 @@ class SingleDonuts(WavefrontFit):
             usable.fields / instrument.telescope.field_radius,
             zernikes,
             [star_error.parts for star_error in errors],
+            np.array([star.light.depth > 0.0 for star in usable.stars], dtype=bool),
             partial(air_of_terms, instrument),
             measured_air=instrument.model.air.atmosphere is None,
         )
@@ -255,17 +266,41 @@ class FieldTerms(WavefrontFit):
                 f"field_noll: {n_field} terms for {len(usable.stars)} usable donuts; expected no more terms"
             )
         over_field = annular_zernikes(int(field_noll.max()), *(usable.fields.T / instrument.telescope.field_radius))
-        maps = np.stack([np.kron(row, np.eye(n_noll)) for row in over_field[field_noll - 1].T])
-        precision = np.tile(instrument.terms.precision, n_field)
-        stars = [_with_held_rims(star) for star in usable.stars]
-        group = Group(tuple(star.stamp for star in stars), maps, precision, instrument.known_seeing)
-        solution = solve(group, usable.unknowns, usable.start(maps, precision), pool=pool)
+        wave_maps = np.stack([np.kron(row, np.eye(n_noll)) for row in over_field[field_noll - 1].T])
+        precision, slopes = np.tile(instrument.terms.precision, n_field), instrument.slope_spreads
+        shared, unknowns = np.append(usable.start(wave_maps, precision), 0.0 * slopes), usable.unknowns
+        maps = [block_diag(of_star, np.eye(len(slopes))) for of_star in wave_maps]
+        precision, first = np.append(precision, slopes**-2.0), len(shared)
+        rims = shared_rims(instrument, usable.stars)
+        for _ in range(RIM_STEPS):
+            stars = [with_shared_rims(instrument, star, rims) for star in usable.stars]
+            group = Group(
+                tuple(star.stamp for star in stars),
+                [block_diag(of_star, np.eye(len(rims))) for of_star in maps],
+                np.concatenate([precision, rims.spreads**-2.0]),
+                instrument.known_seeing,
+                prior_mean=np.concatenate([np.zeros(first), -rims.values[rims.free]]),
+                limits=np.concatenate([np.full(first, np.inf), rims.limits]),
+            )
+            solution = solve(group, unknowns, np.concatenate([shared, np.zeros(len(rims))]), pool=pool)
+            shared, unknowns = solution.shared[:first], list(solution.stars)
+            if settled(rims, solution.shared[first:]):
+                break
+            rims = rims.moved(solution.shared[first:])
         n = len(instrument.terms.requested)
         requested = (n_noll * np.arange(n_field)[:, None] + np.arange(n)).ravel()
         lacking = by_residuals(instrument, stars, group, solution)
         shared_covariance = solution.shared_covariance + lacking.shared_covariance
         return FittedStars(
-            joint_results(stars, solution, lacking, np.array(solution.waves)[:, :n], maps[:, :n]),
+            joint_results(
+                stars,
+                solution,
+                lacking,
+                np.array(solution.waves)[:, :n],
+                [of_star[:n] for of_star in group.maps],
+                moved_rims_of_all(instrument, stars, rims, solution, first),
+                slice(first - len(slopes), first),
+            ),
             solution.shared[requested].reshape(-1, n),
             shared_covariance[np.ix_(requested, requested)],
         )
@@ -276,7 +311,9 @@ def joint_results(
     solution: Solution,
     lacking: Solution,
     zernikes: np.ndarray,
-    zernike_maps: np.ndarray,
+    zernike_maps: np.ndarray | Sequence[np.ndarray],
+    rims: Sequence[list[MovedRim]],
+    slopes: slice,
 ) -> list[FittedStar]:
     """Return the results of stars that share unknowns.
 
@@ -290,10 +327,16 @@ def joint_results(
         The same with the covariance by what the model lacks.
     zernikes : ndarray, shape [n_star, n_noll]
         Wavefront of each star [m].
-    zernike_maps : ndarray, shape [n_star, n_noll, n_shared]
+    zernike_maps : sequence of n_star ndarray, each of shape [n_noll, n_shared]
         Derivatives of the wavefronts with respect to the shared unknowns.
+    rims : sequence of n_star list of MovedRim
+        Rims that stand elsewhere, as each star shows them; empty without any.
+    slopes : slice
+        Which of the shared unknowns are slopes of the response.
     """
     results = []
+    spread_of_slopes = np.sqrt(np.diag(solution.shared_covariance + lacking.shared_covariance)[slopes])
+    response_slope = np.array([solution.shared[slopes], spread_of_slopes])
     for i, star in enumerate(stars):
         pixels = replace(star.full, rays=star.stamp.rays)
         model = model_image(pixels, solution.stars[i], solution.waves[i])
@@ -305,12 +348,7 @@ def joint_results(
         covariance = solution.star_covariance(i) + lacking.star_covariance(i)
         floor = model_floor(zernikes[i])
         parts = ErrorParts.of(spread, lack, np.zeros_like(spread), floor)
-        results.append(FittedStar(pixels, model, solution.stars[i], covariance, zernikes[i], parts))
+        moved = rims[i] if rims else ()
+        unknowns = solution.stars[i]
+        results.append(FittedStar(pixels, model, unknowns, covariance, zernikes[i], parts, moved, response_slope))
     return results
-
-
-def _with_held_rims(star: StarSolution) -> StarSolution:
-    """Return a star whose rims stand where its own fit has them."""
-    rays = star.stamp.rays
-    assert isinstance(rays, ZernikeRays)
-    return replace(star, stamp=replace(star.stamp, rays=rays.at_shifts(star.solution.waves[0])))

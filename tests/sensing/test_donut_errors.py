@@ -185,21 +185,45 @@ def test_scatter_of_donuts_beyond_their_errors_is_claimed():
     fields = rng.uniform(-0.7, 0.7, (30, 2))
     smooth = np.column_stack([np.ones(30), fields]) @ rng.normal(0.0, 100e-9, (3, 19))
     scatter = rng.normal(0.0, 80e-9 / np.sqrt(19), (30, 19))
+    one_side = np.ones(30, dtype=bool)
     checked = cross_checked(
-        fields, smooth + scatter, [parts_of(20e-9)] * 30, lambda: np.eye(19) / 19, measured_air=True
+        fields, smooth + scatter, [parts_of(20e-9)] * 30, one_side, lambda: np.eye(19) / 19, measured_air=True
     )
     assert np.sqrt(np.trace(checked[0].total)) == pytest.approx(80e-9, rel=0.1)
     # Too different to be of one exposure of one telescope.
     unrelated = rng.normal(0.0, 300e-9 / np.sqrt(19), (30, 19))
-    apart = cross_checked(fields, unrelated, [parts_of(20e-9)] * 30, lambda: np.eye(19) / 19, measured_air=True)
+    apart = cross_checked(
+        fields, unrelated, [parts_of(20e-9)] * 30, one_side, lambda: np.eye(19) / 19, measured_air=True
+    )
     assert np.sqrt(np.trace(apart[0].total)) == pytest.approx(20e-9)
+
+
+def test_a_star_on_both_sides_of_focus_claims_what_its_sides_differ_by():
+    fields, sides = np.zeros((2, 2)), np.array([True, False])
+    values = np.outer([0.5, -0.5], np.where(np.arange(19) == 7, 300e-9, 0.0))
+    parts, air = [parts_of(20e-9)] * 2, lambda: np.eye(19) / 19
+    checked = cross_checked(fields, values, parts, sides, air, measured_air=True)
+    difference = checked[0].total + checked[1].total
+    assert np.sqrt(np.trace(difference)) == pytest.approx(300e-9, rel=0.01)
+    # Half of it in the term that differs, beside its part of the rest.
+    assert difference[7, 7] == pytest.approx((0.5 + 0.5 / 19) * 300e-9**2, rel=0.01)
+    # Two donuts of one side may be of two exposures.
+    alone = cross_checked(fields, values, parts, ~sides | sides, air, measured_air=True)
+    assert np.sqrt(np.trace(alone[0].total)) == pytest.approx(20e-9)
 
 
 def test_repeats_of_one_chip_differ_by_less_than_what_the_model_lacks_in_all_of_them():
     rng = np.random.default_rng(6)
     fields = 0.3 + rng.uniform(-0.02, 0.02, (4, 2))
     values = rng.normal(0.0, 100e-9, 19) + rng.normal(0.0, 30e-9 / np.sqrt(19), (4, 19))
-    checked = cross_checked(fields, values, [parts_of(5e-9, 200e-9)] * 4, lambda: np.eye(19) / 19, measured_air=True)
+    checked = cross_checked(
+        fields,
+        values,
+        [parts_of(5e-9, 200e-9)] * 4,
+        np.ones(4, dtype=bool),
+        lambda: np.eye(19) / 19,
+        measured_air=True,
+    )
     assert np.sqrt(np.trace(checked[0].total)) == pytest.approx(200e-9, rel=0.01)
     assert np.sqrt(np.trace(checked[0].repeats)) == pytest.approx(30e-9, rel=0.3)
 

@@ -1,0 +1,110 @@
+"""Rims that stand elsewhere, of all donuts of an exposure: they are of one telescope, and so stand in one place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from .donut_rays import ZernikeRays
+from .image_model import STRENGTH
+from .light import Instrument, StarLight
+from .moving_rims import FreeRims, RimBody
+from .rim_table import MovedRim, rims_at
+from .solve import Solution
+from .stamps import Pixels
+from .star_fitter import StarSolution
+
+#: Step of the rims over their standard deviations that is small enough to be linear.
+_SETTLED = 0.05
+
+
+def shared_rims(instrument: Instrument, stars: Sequence[StarSolution]) -> FreeRims:
+    """Return the rims that are free in the fit of any star by itself, where all of these together have them."""
+    first: dict[tuple[tuple[int, int], ...], RimBody] = {}
+    for star in stars:
+        for body in star.light.free_rims.bodies:
+            first.setdefault(body.members, body)
+    rims = FreeRims()
+    for body in first.values():
+        rims = rims.with_body(body)
+    prior = rims.spreads**-2.0
+    curvature, gradient = np.diag(prior), np.zeros(len(rims))
+    for star in stars:
+        own, begin = star.light.free_rims, len(instrument.noll) + star.light.before_free_rims
+        free = slice(begin, begin + len(own))
+        places = _places(rims, own)
+        information = np.linalg.pinv(star.solution.shared_covariance[free, free], hermitian=True)
+        values = own.values[own.free] + star.solution.shared[free]
+        # The prior of a fit counts once for all of them.
+        curvature[np.ix_(places, places)] += information - np.diag(own.spreads**-2.0)
+        gradient[places] += information @ values
+    return rims.moved(np.linalg.lstsq(curvature, gradient, rcond=1e-12)[0]) if len(rims) else rims
+
+
+def _places(rims: FreeRims, own: FreeRims) -> np.ndarray:
+    """Return the numbers of the free motions of some rims among those of all."""
+    number = {body.members: k for k, body in enumerate(rims.bodies)}
+    index = np.full(rims.free.shape, -1)
+    index[rims.free] = np.arange(len(rims))
+    return np.concatenate([np.zeros(0, dtype=np.int64), *(index[number[b.members]][b.free] for b in own.bodies)])
+
+
+def settled(rims: FreeRims, steps: np.ndarray) -> bool:
+    """Return whether steps of the free motions [n] are so small that the rims need not be moved."""
+    return bool(np.all(np.abs(steps) < _SETTLED * rims.spreads))
+
+
+def light_with(instrument: Instrument, star: StarSolution, rims: FreeRims) -> StarLight:
+    """Return the light of a star with the rims of all where these stand."""
+    own = star.light.free_rims
+    return star.light.with_free_rims(rims, instrument.middle) if rims.bodies or own.bodies else star.light
+
+
+def cells_across(instrument: Instrument, star: StarSolution) -> int:
+    """Return the cells across the pupil that the stamp of a star needs."""
+    stamp = star.stamp
+    fwhm = float(instrument.seeing.fwhm(star.solution.stars[0][STRENGTH]))
+    pixels = Pixels(stamp.image, stamp.variance, stamp.used, round(stamp.grid.scale))
+    return instrument.sampling(star.light, pixels, fwhm).across
+
+
+def with_shared_rims(instrument: Instrument, star: StarSolution, rims: FreeRims) -> StarSolution:
+    """Return a star for unknowns of the wavefront, slopes of the response and free motions of the rims of all stars.
+
+    Other rims stand where the star's own fit has them.
+    """
+    rays, first = star.stamp.rays, len(instrument.noll)
+    assert isinstance(rays, ZernikeRays)
+    held = star.solution.waves[0][first : first + 2 * len(star.light.rims)].copy()
+    if not rims.bodies:
+        return replace(star, stamp=replace(star.stamp, rays=rays.holding(held)))
+    light = light_with(instrument, star, rims)
+    names = rims.surfaces(light.telescope)
+    held[np.repeat(np.array([rim.name in names for rim in light.rims], dtype=bool), 2)] = 0.0
+    stamp, full = star.stamp, star.full
+    if light.pupil_rims is not None:
+        stamp, full = (replace(s, grid=s.grid.with_rims(light.pupil_rims)) for s in (stamp, full))
+    rays = instrument.rays(light, cells_across(instrument, star)).holding(held)
+    return replace(star, light=light, stamp=replace(stamp, rays=rays), full=replace(full, rays=rays))
+
+
+def moved_rims_of_all(
+    instrument: Instrument, stars: Sequence[StarSolution], rims: FreeRims, solution: Solution, first: int
+) -> list[list[MovedRim]]:
+    """Return the rims of all stars as each star shows them.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        Telescope and model of the images.
+    stars : sequence of StarSolution
+        The stars, with the light of these rims.
+    rims : FreeRims
+        Where the telescope has them.
+    solution : Solution
+        Joint solution, with steps of the rims from the number `first` of the shared unknowns on.
+    """
+    steps, covariance = solution.shared[first:], solution.shared_covariance[first:, first:]
+    return [rims_at(instrument, star.light, star.stamp, steps, covariance) for star in stars] if rims.bodies else []
