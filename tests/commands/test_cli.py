@@ -301,7 +301,7 @@ def test_too_little_memory_is_one_line(capsys, monkeypatch):
     def huge(*_, **__):
         raise MemoryError
 
-    monkeypatch.setattr(cli, "app", huge)
+    monkeypatch.setattr(cli, "_built", lambda app: huge)
     assert "not enough memory" in refused(capsys, "run")
 
 
