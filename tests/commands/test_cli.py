@@ -182,7 +182,10 @@ def test_help_loads_nothing_that_computes():
             ["info", "lsst_v3.3_r"],
             ["warp", "trimesh", "scipy.interpolate", "astropy.table", "matplotlib"],
         ),
-        (["spots", "hsc", "--picture", "spots.png"], ["trimesh", "scipy.interpolate", "scipy.sparse", "astropy.table"]),
+        (
+            ["spots", "paul_baker", "--picture", "spots.png"],
+            ["trimesh", "scipy.interpolate", "scipy.sparse", "astropy.table"],
+        ),
     ],
 )
 @pytest.mark.long

@@ -97,7 +97,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(finished_run, copied, 
     assert contents(copied) == contents(finished_run)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ccds_computed_apart_make_the_run_that_one_machine_makes(finished_run, tmp_path, tiny, no_report):
     """As a cluster does it: each machine some CCDs in a folder of its own, brought together and resumed."""
     together = tmp_path / "together"
