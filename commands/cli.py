@@ -9,6 +9,7 @@ no command, after the help; 130: interrupted.
 
 from __future__ import annotations
 
+import functools
 import io
 import logging
 import os
@@ -61,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command_line = sys.argv[1:] if arguments is None else list(arguments)
     try:
         first = command_line[0] if command_line else _completed_command()
-        status = _app_with(first)(args=command_line, prog_name="pachon", standalone_mode=False)
+        status = _built(_app_with(first))(args=command_line, prog_name="pachon", standalone_mode=False)
         sys.stdout.flush()
         if status == _INTERRUPTED:
             return _fail("interrupted", _INTERRUPTED)
@@ -87,6 +88,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail("interrupted", _INTERRUPTED)
 
 
+@functools.cache
+def _built(command_app: typer.Typer) -> Any:
+    """Return what runs the commands of an app; to build it takes longer than a short command."""
+    return typer.main.get_command(command_app)
+
+
+@functools.cache
 def _app_with(first: str) -> typer.Typer:
     """Return an app with the command of a name, and with all where there is none.
 

@@ -8,6 +8,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
+from importlib.util import find_spec
 from typing import Any, TypeVar, cast
 
 import lazy_loader
@@ -75,6 +76,9 @@ def public_names(
                 # The next use finds it without a call, and without a warning.
                 setattr(sys.modules[package], name, value)
                 return value
+        if name.isidentifier() and find_spec(f"{package}.{name}") is not None:
+            # An import of this module looks for an attribute first; a search for near names takes longer than it.
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
         spellings = {n.lower(): f"{package}.{n}" for n in names}
         for owner, module in owners.items():
             spellings |= {n.lower(): f"{package}.{owner}.{n}" for n in module.__all__}

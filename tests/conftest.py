@@ -3,11 +3,13 @@ import os
 import socket
 import subprocess
 import sys
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 import pachon
@@ -43,6 +45,29 @@ def coarse_pictures():
         patch.setattr("pachon.core.plotting._DPI", 60)
         patch.setattr(ConstrainedLayoutEngine, "execute", lambda self, figure: None)
         yield layout
+
+
+@contextmanager
+def _undrawn():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FigureCanvasAgg, "draw", lambda canvas: setattr(canvas, "renderer", canvas.get_renderer()))
+        yield
+
+
+@pytest.fixture(scope="session")
+def undrawn():
+    """Context in which pictures are composed and written but stay empty, since drawing takes most of their time.
+
+    For tests of files and numbers, whose pictures other tests draw.
+    """
+    return _undrawn
+
+
+@pytest.fixture
+def empty_pictures(undrawn):
+    """Pictures are composed and written but stay empty: see `undrawn`."""
+    with undrawn():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,7 @@ from pachon.models import height_statistics
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("empty_pictures")
 def test_the_table_has_the_vendors_and_the_picture_is_written(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["camera"]) == 0

@@ -11,6 +11,9 @@ from scipy.ndimage import gaussian_filter
 import pachon
 from pachon.commands.cli import main
 
+# The pictures are drawn in tests/sensing/test_fit_donuts.py.
+pytestmark = pytest.mark.usefixtures("empty_pictures")
+
 FIELD = (0.6, 0.9)
 OPTIONS = ["--defocus-um", "1500", "--pixel-um", "20", "--zernikes", "11", "--higher-order-nm", "0", "--no-diffraction"]
 

@@ -70,6 +70,7 @@ KINDS = (("image", "fits"), ("image", "png"), ("cutouts", "png"))
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("empty_pictures")
 def test_going_on_keeps_what_is_whole(settings, tmp_path, capsys):
     out = tmp_path / "out"
     plain = settings(image__preview=False, image__cutouts=False)
@@ -86,6 +87,7 @@ def test_going_on_keeps_what_is_whole(settings, tmp_path, capsys):
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("empty_pictures")
 def test_both_ways_and_no_noise_from_options(settings, tmp_path):
     images = []
     for way in ("direct", "eigen"):
@@ -100,6 +102,7 @@ def test_both_ways_and_no_noise_from_options(settings, tmp_path):
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("empty_pictures")
 def test_galaxies_of_a_catalogue_stand_where_it_says(settings, tmp_path):
     # Three on the image, by celestial coordinates, and one on the other side of the field.
     pointing = {"ra_deg": 150.0, "dec_deg": 2.0}
@@ -130,6 +133,7 @@ def test_galaxies_of_a_catalogue_stand_where_it_says(settings, tmp_path):
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("empty_pictures")
 def test_galaxies_of_a_mosaic_are_planted(settings, tmp_path, capsys):
     rng = np.random.default_rng(4)
     y, x = np.indices((400, 400))

@@ -46,6 +46,7 @@ def test_tables(tmp_path, capsys):
     assert str(table["M2.rx"].unit) == "m / rad"
 
 
+@pytest.mark.usefixtures("empty_pictures")
 def test_optimize_writes_a_prescription(tmp_path, capsys):
     command = ["optimize", "paul_baker", "--variables", "M2.conic,Detector.dz", "--merit", "wavefront"]
     assert main([*command, "--bounds", "M2.conic=-0.7:-0.5", "--json"]) == 0
@@ -115,6 +116,7 @@ def test_a_stop_inside_is_filled_and_it_is_said(capsys):
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("empty_pictures")
 def test_an_operand_that_is_not_held_is_said(tmp_path, capsys):
     lens = pachon.load_telescope("paul_baker")
     least = 1e3 * pachon.design.TotalLength(minimum=0.0).measure(lens) + 10.0

@@ -8,6 +8,9 @@ import pytest
 import pachon
 from pachon.commands.cli import main
 
+# The pictures are drawn in test_hostile_names.py.
+pytestmark = pytest.mark.usefixtures("empty_pictures")
+
 LENS = str(Path(__file__).parents[1] / "data" / "zmx" / "lens1.zmx")
 TOLERANCES = """
 fields_deg: [[0, 0], [0, 8]]

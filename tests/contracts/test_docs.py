@@ -49,6 +49,8 @@ WITH_FILES = {
 PEERS = {"batoid.md": "batoid", "from_galsim.md": "galsim", "galsim.md": "galsim", "from_piff.md": "piff"}
 SLOW = {
     "analyses.md",
+    "galsim.md",
+    "design_study.md",
     "measuring.md",
     "from_piff.md",
     "donuts.md",

@@ -160,10 +160,11 @@ LONG = {("design_report", "fields", "zero"), ("check_orientation", "sky_variance
 
 def outcomes(label, function, arguments, chosen):
     """Yield outcome and description of the calls that are chosen by their number."""
-    valid = said(function, arguments)
+    valid = None
     for number, (name, change, wrong, must) in enumerate(mutated(function, arguments)):
         if not chosen(number) or (label, name, change) in LONG:
             continue
+        valid = valid or said(function, arguments)
         kind, text = said(function, wrong)
         if kind == valid[0] and text == valid[1]:
             kind = "accepted"

@@ -192,7 +192,7 @@ def test_sensitivities_are_those_of_differences():
     assert found.matrix[..., 0] == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-9)
 
 
-@pytest.mark.parametrize("merit", ["spots", "wavefront"])
+@pytest.mark.parametrize("merit", [pytest.param("spots", marks=pytest.mark.slow), "wavefront"])
 def test_an_expander_out_of_adjustment_is_optimised(merit, tmp_path):
     found = pachon.optimize(expander(moved=1e-4), ["M2.dz"], merit, [[0.0, 0.0]], threads=1)
     assert found.telescope.surface("M2").vertex[2] == pytest.approx(LONG - SHORT, abs=1e-10)

@@ -35,7 +35,7 @@ def test_absorption_lengths_are_those_of_galsims_table():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("band", "wavelength"), [("z", 870e-9), ("y", 970e-9)])
+@pytest.mark.parametrize(("band", "wavelength"), [pytest.param("z", 870e-9, marks=pytest.mark.slow), ("y", 970e-9)])
 def test_size_and_ellipticity_are_those_of_galsims_sensor(band, wavelength):
     """Photons traced here, with GalSim's refraction, conversion, drift and pixels, against the fast engine."""
     count, rng = 500_000, np.random.default_rng(3)

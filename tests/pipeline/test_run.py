@@ -67,7 +67,11 @@ def test_a_run_leaves_its_files_and_no_other(finished_run):
 
 
 @pytest.mark.long
-def test_running_its_configuration_again_gives_the_same_bytes_on_two_threads(finished_run, tmp_path):
+@pytest.mark.parametrize("drawn", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_running_its_configuration_again_gives_the_same_bytes_on_two_threads(finished_run, tmp_path, drawn, request):
+    """With the report too in the slow form, pictures of which a second process draws."""
+    if not drawn:
+        request.getfixturevalue("no_report")
     config = Experiment.from_config(load_configuration(finished_run / "config.yaml"), finished_run).config
     run(config, tmp_path / "again", execution=Execution(threads=2))
     assert contents(tmp_path / "again") == contents(finished_run)
@@ -93,7 +97,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(finished_run, copied, 
     assert contents(copied) == contents(finished_run)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ccds_computed_apart_make_the_run_that_one_machine_makes(finished_run, tmp_path, tiny, no_report):
     """As a cluster does it: each machine some CCDs in a folder of its own, brought together and resumed."""
     together = tmp_path / "together"

@@ -26,7 +26,8 @@ from pachon.raytrace.kernels.shape_derivatives import added_derivatives
 from pachon.raytrace.pack.shapes import pack_deformations, split_shape
 from pachon.raytrace.rays import Rays, RayStatus
 
-wp.set_module_options(FORWARD_OPTIONS)
+# The kernel of this file runs once: to optimise it would take longer than all else.
+wp.set_module_options(FORWARD_OPTIONS | {"optimization_level": 0})
 
 RNG = np.random.default_rng(5)
 NODES_X, NODES_Y = np.linspace(-1.0, 1.0, 21), np.linspace(-1.1, 1.1, 15)

@@ -220,8 +220,8 @@ def test_an_echelle_in_conical_incidence(order):
             assert np.allclose(end.direction[0], direction[0] * [1.0, 1.0, -1.0], atol=2e-15)
 
 
-def test_repeated_and_chromatic_traces_are_those_of_one_wavelength():
-    """Aimed at a stop behind the grating, and photons of a wavelength each."""
+def stop_behind_a_grating():
+    """A telescope of a concave grating and a stop behind it."""
     ruled = pachon.Surface(
         "grating", pachon.Interaction.MIRROR, pachon.Sphere(1.0), (0.0, 0.0, 0.0), VACUUM,
         rotation=axes(10.0, 0.0, 0.0), grating=pachon.models.Grating(1, 300.0),
@@ -232,15 +232,25 @@ def test_repeated_and_chromatic_traces_are_those_of_one_wavelength():
     screen = pachon.Surface(
         "Detector", pachon.Interaction.DETECTOR, pachon.Plane(), tuple((0.48 * leaving).tolist()), VACUUM
     )
-    telescope = spectrograph(ruled, stop, screen)
+    return spectrograph(ruled, stop, screen)
+
+
+def test_rays_are_aimed_at_a_stop_behind_a_grating():
+    telescope = stop_behind_a_grating()
     aimed = telescope.with_design(
         stop="stop", aiming="real", aperture="entrance_pupil", aperture_value=0.04, fields=((0.0, 0.0),)
     )
     points = (np.array([0.0, 0.01, 0.0]), np.array([0.0, 0.0, 0.015]))
     rays = pachon.launch_rays(aimed, (0.002, -0.001), WAVELENGTH, points)
-    at_stop = stop.to_local(pachon.trace(aimed, rays, "all")[1].position)
+    at_stop = telescope.surfaces[1].to_local(pachon.trace(aimed, rays, "all")[1].position)
     assert np.abs(at_stop[0, :2]).max() < 1e-9
 
+
+# No other test needs the kernel of photons of any wavelength through any telescope, which takes 20 s to compile. It has
+# the loops of two kernels that others need: photons through lenses and mirrors, and rays through any telescope.
+@pytest.mark.slow
+def test_photons_of_a_wavelength_each_land_where_rays_of_it_do():
+    telescope = stop_behind_a_grating()
     rng = np.random.default_rng(7)
     wavelengths = rng.uniform(5e-7, 6e-7, 100)
     x, y = rng.uniform(-0.01, 0.01, (2, 100))
@@ -253,7 +263,7 @@ def test_repeated_and_chromatic_traces_are_those_of_one_wavelength():
         direction = -source[:1] / np.linalg.norm(source[0])
         start = np.array([x[i], y[i], 0.0]) - 2.0 * direction
         ray = pachon.Rays(start, direction, np.zeros(1), float(wavelengths[i]))
-        end = screen.to_local(pachon.trace(telescope, ray).position)[0]
+        end = telescope.surfaces[-1].to_local(pachon.trace(telescope, ray).position)[0]
         assert np.allclose([landed.x[i], landed.y[i]], end[:2], atol=1e-15)
 
 

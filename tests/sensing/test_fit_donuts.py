@@ -317,7 +317,7 @@ def empty_stamp(seed):
 
 
 @pytest.mark.parametrize(
-    "every", [pytest.param(2, marks=pytest.mark.long, id="half"), pytest.param(1, marks=pytest.mark.slow, id="all")]
+    "every", [pytest.param(4, marks=pytest.mark.long, id="quarter"), pytest.param(1, marks=pytest.mark.slow, id="all")]
 )
 def test_empty_stamps_are_flagged_and_the_others_go_on(behind_focus, clean, every):
     flat, rng = np.zeros((SIZE, SIZE)), np.random.default_rng(3)
@@ -343,11 +343,12 @@ def test_empty_stamps_are_flagged_and_the_others_go_on(behind_focus, clean, ever
         fit = pachon.fit_donuts(
             behind_focus, images, [FIELD] * len(images), WAVELENGTH, sky_variance=variance, **options
         )
-        # A donut, zeros, the most negative and NaN, or the largest and infinity.
-        assert picture_bytes(fit.plot([0, 5, 8, 12] if every == 1 else [0, 3, 4, 7]), "png")
+        # A donut, zeros, and of all stamps the most negative and NaN, or negative ones and infinity.
+        assert picture_bytes(fit.plot([0, 5, 8, 12] if every == 1 else [0, 2, 3, 4]), "png")
     assert fit.usable.tolist() == [True] + [False] * len(stamps)
     assert all(fit.reasons[1:])
-    assert set(fit.reasons[1 : noise_stamps + 1]) == {"no donut", "no donut, too few photons"}
+    of_noise, expected = set(fit.reasons[1 : noise_stamps + 1]), {"no donut", "no donut, too few photons"}
+    assert of_noise == expected if every == 1 else of_noise <= expected
     alone = pachon.fit_donuts(behind_focus, images[:1], [FIELD], WAVELENGTH, sky_variance=500.0, **options)
     assert fit.zernikes[0].tobytes() == alone.zernikes[0].tobytes()
 

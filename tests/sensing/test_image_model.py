@@ -128,9 +128,11 @@ def test_derivatives_of_sharp_images_are_central_differences(behind_focus, stren
     np.testing.assert_allclose(image, model_image(stamp, star, wave), atol=1e-6 * image.max())
     # All light is on the stamp, but for the air's wings.
     assert (image - 3.0).sum() == pytest.approx(1e6 * (1.3 if companion else 1.0), rel=2e-3)
-    for k, step in enumerate(steps):
+    # Of the wavefront every third term: all go the same way.
+    for k in (*range(len(star)), *range(len(star), len(steps), 3)):
         if k == STRENGTH and strength == 0.0:
             continue
+        step = steps[k]
         ends = [
             model_image(stamp, *np.split(joined + sign * step * np.eye(len(joined))[k], [len(star)]))
             for sign in (1.0, -1.0)

@@ -198,7 +198,7 @@ def of_two_threads_of_blas(exposure, few, lsst_r, wavelengths):
         )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_no_prediction_depends_on_the_threads_of_blas(of_two_threads_of_blas, aligned):
     two = of_two_threads_of_blas
     assert two.chi2 == aligned.chi2

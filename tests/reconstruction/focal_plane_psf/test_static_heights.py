@@ -17,23 +17,41 @@ STEPS = 2
 
 
 @pytest.fixture(scope="module")
-def exposures(exposure_of, part):
+def two_of(exposure_of, part):
     """Two exposures of one focal plane, the stars at the same places; turbulence and noise are their own."""
-    plane = FocalPlane.from_budget(part("R23", count=4), seed=5)
-    return [exposure_of(plane, stars=20, holdout=0, noise=5e-4, turbulence=0.001, seed=s) for s in (1, 2)]
+
+    def of(ccds, stars):
+        plane = FocalPlane.from_budget(part("R23", count=ccds), seed=5)
+        return [exposure_of(plane, stars=stars, holdout=0, noise=5e-4, turbulence=0.001, seed=s) for s in (1, 2)]
+
+    return of
 
 
 @pytest.fixture(scope="module")
-def fit(exposures, lsst_r, wavelengths):
-    """``fit([0, 1], folder=...)``"""
-    instrument, camera = Instrument.of(lsst_r, wavelengths), exposures[0].camera
+def fit_to(lsst_r, wavelengths):
+    """``fit_to(exposures)([0, 1], folder=...)``"""
+    instrument = Instrument.of(lsst_r, wavelengths)
 
-    def of(which, telescope=instrument, **options):
-        stars = [exposures[i].stars() for i in which]
-        aligned = OpticsPrior(alignment_rms=0.0)
-        return fit_static_heights(stars, telescope, camera=camera, prior=aligned, steps=STEPS, **options)
+    def of(exposures):
+        def fit(which, telescope=instrument, **options):
+            stars, camera = [exposures[i].stars() for i in which], exposures[0].camera
+            aligned = OpticsPrior(alignment_rms=0.0)
+            return fit_static_heights(stars, telescope, camera=camera, prior=aligned, steps=STEPS, **options)
+
+        return fit
 
     return of
+
+
+@pytest.fixture(scope="module")
+def exposures(two_of):
+    """Few stars: of tests of files and bytes."""
+    return two_of(2, 10)
+
+
+@pytest.fixture(scope="module")
+def fit(exposures, fit_to):
+    return fit_to(exposures)
 
 
 @pytest.fixture(scope="module")
@@ -54,9 +72,10 @@ def error(heights, truth):
 
 
 @pytest.mark.slow
-def test_two_exposures_tell_the_heights_better_than_one(exposures, fit, both):
-    truth = exposures[0].plane
-    one = [fit([i]) for i in range(2)]
+def test_two_exposures_tell_the_heights_better_than_one(two_of, fit_to):
+    exposures = two_of(4, 20)
+    truth, fit = exposures[0].plane, fit_to(exposures)
+    one, both = [fit([i]) for i in range(2)], [fit([0, 1])]
     assert error(both[0], truth) < np.mean([error(o, truth) for o in one])
     assert error(both[0], truth) < error(StaticHeights(FocalPlane.flat(truth.camera), both[0].covariance, 0), truth)
     # More data make every CCD better known; by less than sqrt(2), since there is a prior.
@@ -68,7 +87,7 @@ def test_two_exposures_tell_the_heights_better_than_one(exposures, fit, both):
 @pytest.mark.slow
 def test_covariances_are_those_of_the_legendre_terms(both, exposures):
     covariance = both[0].covariance
-    assert covariance.shape == (4, len(powers(6)), len(powers(6)))
+    assert covariance.shape == (2, len(powers(6)), len(powers(6)))
     for each in covariance:
         np.testing.assert_allclose(each, each.T, atol=1e-12 * np.abs(each).max())
         assert np.linalg.eigvalsh(each)[0] > 0.0

@@ -169,6 +169,7 @@ def test_settings_that_do_not_fit(night_config, tmp_path):
         run_night(night_config(), tmp_path, part=(4, 4))
 
 
+@pytest.mark.usefixtures("empty_pictures")
 def test_psfs_alone(night_config, tmp_path):
     result = run_night(night_config(models=False, maps={"nside": 0}), tmp_path)
     rows = detector_table(result.folder).to_pydict()

@@ -58,6 +58,7 @@ def test_a_verdict_of_nights_without_models_or_bands():
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("empty_pictures")
 def test_a_night_has_the_correlation_of_its_products_and_a_page(night_config, tmp_path):
     config = night_config(run={"ccds": ["R22_S11", "R22_S12"]}, products=True, maps={"nside": 0})
     result = run_night(config, tmp_path / "night", execution=Execution(threads=1))

@@ -70,6 +70,7 @@ def test_metrics_of_a_store_write_no_picture_outside_the_folder(tmp_path):
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("empty_pictures")
 @pytest.mark.parametrize("slope", [pytest.param(0.0, marks=pytest.mark.slow), -1.0, math.nan])
 def test_a_metric_that_nothing_raises_has_a_report_without_allowances(tmp_path, slope):
     points = numbered_points(SWEEP, Path())

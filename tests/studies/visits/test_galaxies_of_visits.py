@@ -24,12 +24,13 @@ POINTING = {"ra_deg": 150.0, "dec_deg": 2.0}
 
 
 @pytest.fixture(scope="module")
-def folder(visits_config, tmp_path_factory):
+def folder(visits_config, tmp_path_factory, undrawn):
     """Folder of one visit, about a place on the sky."""
     place = tmp_path_factory.mktemp("visits")
     config = visits_config(count=1, places=12)
     run = config.run.model_validate(config.run.model_dump(by_alias=True) | {"pointing": POINTING})
-    stack_visits(config.model_copy(update={"run": run}), place, execution=Execution(threads=1))
+    with undrawn():
+        stack_visits(config.model_copy(update={"run": run}), place, execution=Execution(threads=1))
     return place
 
 

@@ -73,6 +73,7 @@ def test_a_list_is_read_once_while_it_stays_the_same(visits_config, list_file, m
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("empty_pictures")
 def test_a_stack_of_a_list(visits_config, list_file, tmp_path):
     section = ListSection(list=str(list_file), band="r", where="observationId < 1003")
     config = visits_config(snapshots=(1,)).with_list(section)

@@ -22,7 +22,8 @@ from pachon.studies.visits.sky_points import draw_points
 from pachon.studies.visits.stack import PsfStack
 from pachon.studies.visits.visits import SUMS_NAME, _left_out_line, cell_of, stack_path, stack_visits
 
-pytestmark = pytest.mark.long
+# The pictures are those of test_null_test.py.
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("empty_pictures")]
 
 
 def content(folder):
@@ -30,9 +31,10 @@ def content(folder):
 
 
 @pytest.fixture(scope="module")
-def stacked(visits_config, tmp_path_factory):
+def stacked(visits_config, tmp_path_factory, undrawn):
     folder = tmp_path_factory.mktemp("visits")
-    return stack_visits(visits_config(), folder, execution=Execution(threads=1)), folder
+    with undrawn():
+        return stack_visits(visits_config(), folder, execution=Execution(threads=1)), folder
 
 
 def test_psfs_are_those_of_the_detector_turned_with_the_sky(visits_config):

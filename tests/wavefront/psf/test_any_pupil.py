@@ -87,13 +87,23 @@ LSST, COARSE = ImagePlane(31, 10e-6, 4e-6), ImagePlane(37, 15e-6, 5e-6)
 @pytest.mark.parametrize(
     ("make", "field_deg", "plane", "wavelengths", "spacing", "longest"),
     [
-        (lambda: defocused("hsc", 20e-6), (0.5, 0.5), COARSE, 770e-9, 0.0125, 1.0),
+        pytest.param(lambda: defocused("hsc", 20e-6), (0.5, 0.5), COARSE, 770e-9, 0.0125, 1.0, marks=pytest.mark.slow),
         # Other wavelengths, where dark rays pass the lenses far outside of what is ground.
         (lambda: defocused("hsc", -10e-6), (-0.2, 0.69), COARSE, [700e-9, 820e-9], 0.0125, 1.0),
-        (lambda: defocused("decam", 20e-6), (0.5, -0.7), COARSE, [580e-9, 640e-9, 700e-9], 0.01, 1.0),
+        pytest.param(
+            lambda: defocused("decam", 20e-6),
+            (0.5, -0.7),
+            COARSE,
+            [580e-9, 640e-9, 700e-9],
+            0.01,
+            1.0,
+            marks=pytest.mark.slow,
+        ),
         (lambda: defocused("lsst_v3.3_r_obstructed", 10e-6), (1.3, -0.8), LSST, 620e-9, 0.0125, 1.0),
         # Vignetted to a half and to 0.38 of the ring; and a small pupil, of which strips along the rims are a half.
-        (lambda: tube(defocused("lsst_v3.3_r", 10e-6)), (0.9, 0.6), LSST, 620e-9, 0.0125, 1.0),
+        pytest.param(
+            lambda: tube(defocused("lsst_v3.3_r", 10e-6)), (0.9, 0.6), LSST, 620e-9, 0.0125, 1.0, marks=pytest.mark.slow
+        ),
         (lambda: tube(defocused("lsst_v3.3_r", 10e-6)), (1.3, 1.1), LSST, 620e-9, 0.0125, 1.0),
         (lambda: defocused("auxtel", 150e-6), (0.03, 0.04), ImagePlane(65, 10e-6, 4e-6), 620e-9, 0.004, 1.19),
     ],

@@ -112,11 +112,11 @@ def brute_force(telescope, field, wavelength, *, spacing=0.0125, longest=1.0, ab
         # What is left of e is from bends of the wavefront within a baseline and from the points of the pupil, 4e-5
         # each at the heights that CCDs have, and 1e-4 each at 20 um of defocus at the edge of the field.
         ((0.0, 0.0), 10e-6, 0.0, 1e-6, 1e-6),
-        ((0.8, 0.6), 0.0, 0.0, 6e-5, 1e-3),
-        ((-0.9, 1.07), -10e-6, 0.0, 6e-5, 1e-3),
+        pytest.param((0.8, 0.6), 0.0, 0.0, 6e-5, 1e-3, marks=pytest.mark.slow),
+        pytest.param((-0.9, 1.07), -10e-6, 0.0, 6e-5, 1e-3, marks=pytest.mark.slow),
         ((-0.9, 1.07), 10e-6, 0.2e-6, 6e-5, 1e-3),
         ((1.5, -0.8), 20e-6, 0.0, 2e-4, 3e-3),
-        ((-0.2, -1.74), -20e-6, 0.0, 2e-4, 3e-3),
+        pytest.param((-0.2, -1.74), -20e-6, 0.0, 2e-4, 3e-3, marks=pytest.mark.slow),
     ],
 )
 def test_against_brute_force_over_the_pupil(lsst_r, field_deg, defocus, residual, shape, place):

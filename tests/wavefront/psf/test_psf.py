@@ -55,8 +55,15 @@ def full_width(image):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("engine", ["fast", "wave"])
-@pytest.mark.parametrize("turbulent", [False, True])
+@pytest.mark.parametrize(
+    ("engine", "turbulent"),
+    [
+        ("fast", True),
+        ("wave", False),
+        pytest.param("fast", False, marks=pytest.mark.slow),
+        pytest.param("wave", True, marks=pytest.mark.slow),
+    ],
+)
 def test_what_comes_back(lsst_r, engine, turbulent):
     focal_plane = pachon.FocalPlane.from_budget("lsst", seed=1)
     fields = fields_at(lsst_r, focal_plane.camera.centers[[94, 10]])

@@ -73,11 +73,11 @@ def turbulence(**options):
     ("engine", "wavelength", "atmosphere", "allowed"),
     [
         # Two depths are exact up to the third moment of the path, three up to the fifth; air blurs the rest.
-        (LongExposureEngine(), 870e-9, turbulence(), 1e-3),
+        pytest.param(LongExposureEngine(), 870e-9, turbulence(), 1e-3, marks=pytest.mark.slow),
         (LongExposureEngine(), 970e-9, turbulence(), 1e-3),
         (WaveEngine(pupil_spacing=0.08), 870e-9, None, 1e-3),
         # 4 time steps, each at each depth.
-        (WaveEngine(pupil_spacing=0.08), 970e-9, turbulence(), 1e-3),
+        pytest.param(WaveEngine(pupil_spacing=0.08), 970e-9, turbulence(), 1e-3, marks=pytest.mark.slow),
         # Two sharp rings in place of a smooth blur, on cells of a micrometre.
         (FastEngine(n_pupil=3000, oversampling=6), 970e-9, None, 1.5e-2),
         # 134 time steps that share the depths; another ray in a cell makes 1e-2 with 4 steps.

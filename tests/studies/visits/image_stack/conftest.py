@@ -38,18 +38,20 @@ def visits_folder(small_visits, tmp_path):
 
 
 @pytest.fixture(scope="package")
-def visit_products(small_visits, tmp_path_factory):
+def visit_products(small_visits, tmp_path_factory, undrawn):
     """Folder of two visits, with the stacks of their PSFs."""
     folder = tmp_path_factory.mktemp("visits")
-    stack_visits(small_visits, folder)
+    with undrawn():
+        stack_visits(small_visits, folder)
     return folder
 
 
 @pytest.fixture(scope="package")
-def noise_free(visit_products, round_galaxies, tmp_path_factory):
+def noise_free(visit_products, round_galaxies, tmp_path_factory, undrawn):
     """Stack of two visits without noise, with round galaxies, beside that of the PSFs."""
     folder = tmp_path_factory.mktemp("noise_free")
     config = load_visits_configuration(visit_products / CONFIG_NAME)
     (folder / CONFIG_NAME).write_text(config.model_copy(update={"galaxies": round_galaxies}).to_yaml())
     psfs = {visits: PsfStack.read(stack_path(visit_products, visits)) for visits in (1, 2)}
-    return stack_images(folder, ImageStackConfig(faintest=25.0, side=1024, noise=False)), psfs
+    with undrawn():
+        return stack_images(folder, ImageStackConfig(faintest=25.0, side=1024, noise=False)), psfs
