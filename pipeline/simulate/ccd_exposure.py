@@ -142,7 +142,14 @@ def expose_ccds(
         observed, centered_stars = _expose_twice(experiment, groups, offsets, threads, progress, temperatures=kelvin)
     else:
         observed = _expose(
-            experiment, groups, threads, progress, offsets=offsets, room=_SHIFT_ROOM, temperatures=kelvin
+            experiment,
+            groups,
+            threads,
+            progress,
+            offsets=offsets,
+            room=_SHIFT_ROOM,
+            cut_off=True,
+            temperatures=kelvin,
         )
     exposures = []
     of_holdout, of_observed = (slices_of(parts) for parts in (holdout_groups, groups))
@@ -192,6 +199,7 @@ def _expose_twice(
         threads,
         progress,
         room=_SHIFT_ROOM,
+        cut_off=True,
         offsets=offsets,
         recenter=kept_centroid,
         temperatures=temperatures,
@@ -239,6 +247,7 @@ def _expose(
     progress: Callable[[int], None] | None = None,
     *,
     room: int = 0,
+    cut_off: bool = False,
     offsets: np.ndarray | None = None,
     recenter: Callable[[np.ndarray, float], np.ndarray] | None = None,
     along: str | None = None,
@@ -246,7 +255,8 @@ def _expose(
 ) -> NoiseFreeStars:
     """Make PSFs at positions on the detector, `offsets` [pixel] from the centre of a pixel, on stamps with `room`.
 
-    Positions are those of groups [m], [n, 2] each, one after the other; no byte of a group depends on the others.
+    Positions are those of groups [m], [n, 2] each, one after the other; no byte of a group depends on the others. With
+    `cut_off` the room is for centring alone, and wings may wrap around there.
     Stars are blackbodies of `temperatures` [K]; spectra are flat where they are NaN, and by default.
     """
     config, wavelengths = experiment.config, experiment.wavelengths
@@ -284,7 +294,7 @@ def _expose(
             experiment.silicon,
             offsets,
             recenter,
-            room,
+            room if cut_off else 0,
         ),
         engine=psf_engine(config.psf.engine).with_n_pupil(config.psf.n_pupil),
         threads=threads,
