@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command_line = sys.argv[1:] if arguments is None else list(arguments)
     try:
         first = command_line[0] if command_line else _completed_command()
-        status = _built(_app_with(first))(args=command_line, prog_name="pachon", standalone_mode=False)
+        status = _built(first)(args=command_line, prog_name="pachon", standalone_mode=False)
         sys.stdout.flush()
         if status == _INTERRUPTED:
             return _fail("interrupted", _INTERRUPTED)
@@ -89,12 +89,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 @functools.cache
-def _built(command_app: typer.Typer) -> Any:
-    """Return what runs the commands of an app; to build it takes longer than a short command."""
-    return typer.main.get_command(command_app)
+def _built(first: str) -> Any:
+    """Return what runs the command of a name, once built: that takes longer than a short command."""
+    return typer.main.get_command(_app_with(first))
 
 
-@functools.cache
 def _app_with(first: str) -> typer.Typer:
     """Return an app with the command of a name, and with all where there is none.
 

@@ -120,10 +120,15 @@ class Linearized:
 
     def over_noise(self, columns: np.ndarray) -> np.ndarray:
         """Return columns of all pixels [ny, nx, k] at those in use, over their standard deviations, [n_pixel, k]."""
-        # A slice where all pixels are used, since that is no copy.
-        used = self.used if not self.used.all() else np.s_[:, :]
-        root = (1.0 / np.sqrt(self.variance[used].ravel())).astype(np.float32)
-        return np.asarray(columns[used].reshape(len(root), -1) * root[:, None])
+        return _over_noise(columns, self.variance, self.used)
+
+
+def _over_noise(columns: np.ndarray, variance: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Return columns [ny, nx, k] at the pixels in use, over their standard deviations, shape [n_pixel, k]."""
+    # A slice where all pixels are used, since that is no copy.
+    pixels = used if not used.all() else np.s_[:, :]
+    root = (1.0 / np.sqrt(variance[pixels].ravel())).astype(np.float32)
+    return np.asarray(columns[pixels].reshape(len(root), -1) * root[:, None])
 
 
 @dataclass
@@ -200,14 +205,11 @@ def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Lineariz
     if derivatives is None:
         return None
     model, columns, scales = derivatives
-    # A slice where all pixels are used, since that is no copy.
-    used = stamp.used if not stamp.used.all() else np.s_[:, :]
     variance = _variance(stamp, model)
-    residual = (stamp.image - model)[used].ravel()
-    root = (1.0 / np.sqrt(variance[used].ravel())).astype(np.float32)
-    scaled = columns[used].reshape(len(root), -1) * root[:, None]
+    residual = (stamp.image - model)[stamp.used]
+    scaled = _over_noise(columns, variance, stamp.used)
     brightness = unknowns[FLUX] * columns[..., FLUX].astype(np.float64)
-    over_noise = residual.astype(np.float32) * root
+    over_noise = _over_noise((stamp.image - model).astype(np.float32)[..., None], variance, stamp.used)[:, 0]
     point = Linearized(model, variance, brightness, stamp.used, residual, over_noise, scaled, scales)
     stamp.grid.point = _Point(stamp, unknowns.copy(), wave.copy(), point)
     return point

@@ -170,7 +170,7 @@ class Deposit:
 
     def light(self, weights: np.ndarray) -> np.ndarray:
         """Return the light of weighted points [n] on the cells, shape [n_cell, 1]."""
-        return self._deposited(weights, np.zeros((2, self._count, 0)), np.zeros((self._count, 0)), 1.0, 1)
+        return self.derivatives(weights, np.zeros((2, self._count, 0)), np.zeros((self._count, 0)), 1.0, 1)
 
     def derivatives(
         self, weights: np.ndarray, response: np.ndarray, rates: np.ndarray, scale: float, head: int = 3
@@ -195,11 +195,6 @@ class Deposit:
         ndarray of float32, shape [n_cell, head + k + j]
             The light, its derivatives along x and y, further columns, and the derivatives by the unknowns.
         """
-        return self._deposited(weights, response, rates, scale, head)
-
-    def _deposited(
-        self, weights: np.ndarray, response: np.ndarray, rates: np.ndarray, scale: float, head: int
-    ) -> np.ndarray:
         columns = head + response.shape[2] + rates.shape[1]
         cells = np.zeros((self._size[0] * self._size[1], columns), dtype=np.float32)
         values = (warp_array(v, wp.float32) for v in (weights, response, rates))

@@ -32,23 +32,23 @@ def shared_rims(instrument: Instrument, stars: Sequence[StarSolution]) -> FreeRi
     prior = rims.spreads**-2.0
     curvature, gradient = np.diag(prior), np.zeros(len(rims))
     for star in stars:
-        own, begin = star.light.free_rims, len(instrument.noll) + star.light.before_free_rims
-        free = slice(begin, begin + len(own))
-        places = _places(rims, own)
+        star_rims, begin = star.light.free_rims, len(instrument.noll) + star.light.before_free_rims
+        free = slice(begin, begin + len(star_rims))
+        places = _places(rims, star_rims)
         information = np.linalg.pinv(star.solution.shared_covariance[free, free], hermitian=True)
-        values = own.values[own.free] + star.solution.shared[free]
+        values = star_rims.values[star_rims.free] + star.solution.shared[free]
         # The prior of a fit counts once for all of them.
-        curvature[np.ix_(places, places)] += information - np.diag(own.spreads**-2.0)
+        curvature[np.ix_(places, places)] += information - np.diag(star_rims.spreads**-2.0)
         gradient[places] += information @ values
     return rims.moved(np.linalg.lstsq(curvature, gradient, rcond=1e-12)[0]) if len(rims) else rims
 
 
-def _places(rims: FreeRims, own: FreeRims) -> np.ndarray:
+def _places(rims: FreeRims, star_rims: FreeRims) -> np.ndarray:
     """Return the numbers of the free motions of some rims among those of all."""
     number = {body.members: k for k, body in enumerate(rims.bodies)}
     index = np.full(rims.free.shape, -1)
     index[rims.free] = np.arange(len(rims))
-    return np.concatenate([np.zeros(0, dtype=np.int64), *(index[number[b.members]][b.free] for b in own.bodies)])
+    return np.concatenate([np.zeros(0, dtype=np.int64), *(index[number[b.members]][b.free] for b in star_rims.bodies)])
 
 
 def settled(rims: FreeRims, steps: np.ndarray) -> bool:
@@ -58,8 +58,8 @@ def settled(rims: FreeRims, steps: np.ndarray) -> bool:
 
 def light_with(instrument: Instrument, star: StarSolution, rims: FreeRims) -> StarLight:
     """Return the light of a star with the rims of all where these stand."""
-    own = star.light.free_rims
-    return star.light.with_free_rims(rims, instrument.middle) if rims.bodies or own.bodies else star.light
+    star_rims = star.light.free_rims
+    return star.light.with_free_rims(rims, instrument.middle) if rims.bodies or star_rims.bodies else star.light
 
 
 def cells_across(instrument: Instrument, star: StarSolution) -> int:
