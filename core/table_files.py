@@ -22,6 +22,8 @@ from .products import Card, Columns, card_text
 FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits", ".parquet": "parquet"}
 #: Endings of files that are read.
 ENDINGS = (*FORMATS, ".fit")
+# Of columns in CSV files; the first where a file has one column.
+_DELIMITERS = ",;\t"
 #: Values, unit in FITS notation and description.
 Described = tuple[np.ndarray, str, str]
 
@@ -45,10 +47,22 @@ def read_columns(path: Path) -> dict[str, Column | np.ndarray]:
             if kind == "parquet":
                 content = parquet_module(path, ProductError).read_table(io.BytesIO(data))
                 return {name.lower(): content[name].to_numpy() for name in content.column_names}
-            # Numbers of a CSV file that are left out are masked.
-            source: Any = io.BytesIO(data) if kind == "fits" else text_lines(data.decode())
-            table = Table.read(source, format=kind)
+            table = Table.read(io.BytesIO(data), format=kind) if kind == "fits" else text_table(data, kind)
     return {name.lower(): table[name] for name in table.colnames}
+
+
+def text_table(data: bytes, kind: str = "ascii.csv") -> Table:
+    """Return the table of a file of CSV or ECSV; numbers that a CSV file leaves out are masked.
+
+    CSV files are also those of spreadsheets, with a byte order mark, comments, semicolons or tabs for commas.
+    """
+    lines = text_lines(data.decode("utf-8-sig"))
+    if kind == "ascii.ecsv" or (lines and lines[0].startswith("# %ECSV")):
+        return Table.read(lines, format="ascii.ecsv")
+    head = next((line for line in lines if line.strip() and not line.startswith("#")), None)
+    if head is None:
+        return Table()
+    return Table.read(lines, format=kind, delimiter=max(_DELIMITERS, key=head.count), comment=r"\s*#")
 
 
 def parquet_module(path: Path, error: type[PachonError]) -> Any:

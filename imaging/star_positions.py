@@ -10,8 +10,9 @@ from astropy.io import fits
 from astropy.table import Table
 
 from ..core.errors import DomainError, ProductError
-from ..core.files import parsing, read_bytes, text_lines
+from ..core.files import parsing, read_bytes
 from ..core.fits_files import open_fits
+from ..core.table_files import text_table
 from .image_file import CcdImage
 
 #: Columns of pixels, the first one's centre at (0, 0), in small letters.
@@ -79,8 +80,7 @@ def table_in(path: Path) -> Table:
     with warnings.catch_warnings(), parsing(path, "no table of stars", ProductError):
         warnings.simplefilter("ignore")
         if not data.startswith(b"SIMPLE"):
-            kind = "ascii.ecsv" if data.lstrip().startswith(b"# %ECSV") else "ascii.csv"
-            return Table.read(text_lines(data.decode()), format=kind)
+            return text_table(data)
         with open_fits(path, ProductError, content=data, lazy_load_hdus=False) as hdus:
             tables = [Table.read(hdu) for hdu in hdus if isinstance(hdu, (fits.BinTableHDU, fits.TableHDU))]
     known_names = {name for names in (*_FROM_ONE, *_FROM_ZERO, *_CELESTIAL, _CELESTIAL_RADIAN) for name in names}

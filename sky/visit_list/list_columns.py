@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from astropy import units as u
 
-from ...core.errors import DomainError, ProductError
+from ...core.errors import DomainError, ProductError, cut_short
 from ...core.units import ARCSEC
 from .list_table import ListTable
 from .names import QUANTITIES
@@ -33,8 +33,10 @@ class ListColumns:
             for key, quantity in QUANTITIES.items()
             if (name := next((name for name in quantity.names if name in table.columns), None)) is not None
         }
-        selected = table.select(list(dict.fromkeys(source.values())), where) if source else {}
         columns = cls({}, source, table.kind, table.columns)
+        if not source:
+            columns.require("ra")
+        selected = table.select(list(dict.fromkeys(source.values())), where)
         # OpSim 3 has its angles in radians.
         in_radians = table.kind == "sqlite" and {"expmjd", "obshistid"} <= set(table.columns)
         if in_radians:
@@ -94,10 +96,7 @@ class ListColumns:
 def _in_si(values: np.ndarray, file_unit: Any, unit: str, name: str) -> np.ndarray:
     """Return a column in SI units, angles in radians; dates stay days."""
     if values.dtype.kind == "U":
-        try:
-            values = np.array([float(text) if text.strip() else np.nan for text in values.tolist()])
-        except ValueError:
-            raise DomainError(f"column {name}: expected numbers", key=name) from None
+        values = _as_numbers(values, name)
     if not unit or unit in ("mag", "pixel"):
         return values
     default = u.Unit(unit)
@@ -108,6 +107,20 @@ def _in_si(values: np.ndarray, file_unit: Any, unit: str, name: str) -> np.ndarr
         return np.asarray((values * column_unit).to_value(target[kind]), dtype=np.float64)
     except (u.UnitsError, TypeError, AttributeError):
         raise DomainError(f"column {name} in {file_unit}: expected a unit such as {unit}", key=name) from None
+
+
+def _as_numbers(texts: np.ndarray, name: str) -> np.ndarray:
+    """Return texts as numbers, NaN where empty; DomainError names the first that is none, and its row."""
+    numbers = np.full(len(texts), np.nan)
+    for row, text in enumerate(texts.tolist()):
+        if text.strip():
+            try:
+                numbers[row] = float(text)
+            except ValueError:
+                raise DomainError(
+                    f"column {name}, row {row + 1}: {cut_short(text)!r}: expected a number", key=name
+                ) from None
+    return numbers
 
 
 def _shown(value: float, unit: str) -> str:

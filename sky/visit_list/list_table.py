@@ -16,7 +16,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ...core.errors import ConfigError, ProductError, cut_short, unknown_name
+from ...core.errors import ConfigError, ProductError, cut_short
 from ...core.table_files import ENDINGS, read_columns
 from .names import HEADER_WORDS
 
@@ -137,7 +137,10 @@ def _database_table(connection: sqlite3.Connection, path: Path) -> ListTable:
         if name is None and len(tables) == 1:
             (name,) = tables.values()
         if name is None:
-            raise unknown_name("table of visits", "observations", tables or ["none"]).within(file=path)
+            known, there = ", ".join(_TABLES), ", ".join(tables.values()) or "none"
+            raise ProductError(
+                f"no table of visits: expected {known}, or a single table; tables are {there}", file=path
+            )
         columns = tuple(row[1].lower() for row in connection.execute(f'PRAGMA table_info("{name}")'))
     except (sqlite3.Error, UnicodeError) as error:
         raise ProductError(f"cannot be read ({error})", file=path) from None

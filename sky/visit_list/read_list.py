@@ -161,10 +161,9 @@ def _visit_numbers(columns: ListColumns) -> np.ndarray:
     unique, counts = np.unique(numbers, return_counts=True)
     if (counts > 1).any():
         twice = unique[counts > 1]
+        others = f"; {len(twice)} numbers are repeated" if len(twice) > 1 else ""
         raise DomainError(
-            f"{name} = {twice[0]}: {counts[counts > 1][0]} rows, expected each visit once; "
-            f"{len(twice)} numbers are there more than once",
-            key=name,
+            f"{name} = {twice[0]}: {counts[counts > 1][0]} rows, expected each visit once{others}", key=name
         )
     return numbers
 

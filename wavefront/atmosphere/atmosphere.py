@@ -109,7 +109,7 @@ class Atmosphere(LayerScreens):
         ----------
         site : str or Site
             Bundled site, path of a site file, or site; :meth:`Site.with_layers` gives one with other layers and winds.
-            No layer may drift farther in the exposure than its screen is long.
+            Engines with screens take exposures in which no layer drifts farther than its screen is long.
         seed : int
             Seed of the run, not negative: it fixes offsets, screens, and those directions of the wind that the site
             does not state.
@@ -155,7 +155,6 @@ class Atmosphere(LayerScreens):
             raise DomainError(f"time_step = {time_step!r}: expected at most {_MOST_STEPS} steps in {exposure:g} s")
         steps = max(1, math.ceil(ratio - 1e-9))
         speed, length = np.array(site.wind_speeds), float(screens.screen_length)
-        check_drift(height, speed, exposure, length)
         direction = wind_directions(site, seed, epoch)
         weights = np.array(site.weights)
         offsets = length * np.array([layer_random(seed, epoch, n, "offset", 2) for n in range(len(height))])
@@ -199,8 +198,7 @@ class Atmosphere(LayerScreens):
         Raises
         ------
         DomainError
-            If the times are not the middles of equal steps of the exposure, or a layer drifts farther in it than its
-            screen is long.
+            If the times are not the middles of equal steps of the exposure.
         """
         middles = pure_numbers(times, "times").copy()
         if middles.ndim != 1 or len(middles) == 0 or not np.all(np.isfinite(middles)):
@@ -211,7 +209,6 @@ class Atmosphere(LayerScreens):
         step = exposure / len(middles)
         if not np.allclose(np.diff(middles), step, rtol=1e-6, atol=0.0):
             raise DomainError(f"times: expected the middles of {len(middles)} equal steps of {step:g} s, rising")
-        check_drift(self.altitudes, np.hypot(*self.velocities.T), exposure, self.screen_length)
         middles.setflags(write=False)
         return replace(self, exposure=exposure, times=middles)
 
@@ -234,6 +231,14 @@ class Atmosphere(LayerScreens):
             raise DomainError(f"altitudes = {altitudes!r}: expected {self.layer_count} distances of 0 m or more")
         heights.setflags(write=False)
         return replace(self, altitudes=heights)
+
+    def screens(self, kind: str, threads: int | None = None, rows: np.ndarray | None = None) -> np.ndarray:
+        """Return the screens of all layers, as :meth:`.LayerScreens.screens` does.
+
+        DomainError, besides, if a layer drifts farther in the exposure than its screen is long.
+        """
+        check_drift(self.altitudes, np.hypot(*self.velocities.T), self.exposure, self.screen_length)
+        return super().screens(kind, threads, rows)
 
     def rows_under(self, directions: np.ndarray, radius: float) -> np.ndarray:
         """Return the rows of the low screens that light of a pupil crosses, bool [n_layer, screen_size].

@@ -94,7 +94,8 @@ def check_drift(distances: np.ndarray, speeds: np.ndarray, exposure: float, leng
     if drift >= length:
         raise DomainError(
             f"screen_length = {length:g}: expected more than {drift:g} m, which layer {layer} at {distances[layer]:g} m"
-            f" drifts in {exposure:g} s: screens are periodic, and light would meet the same turbulence again"
+            f" drifts in {exposure:g} s: screens are periodic, and light would meet the same turbulence again ("
+            "'statistical' and 'long_exposure' need none)"
         )
 
 

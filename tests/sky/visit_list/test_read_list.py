@@ -1,5 +1,8 @@
 """Visit lists: angles by spherical trigonometry and astropy, air by Tokovinin's formula, formats by each other."""
 
+import sqlite3
+from contextlib import closing
+
 import numpy as np
 import pytest
 from astropy import units as u
@@ -189,6 +192,24 @@ def test_tables(visits, tmp_path, ending):
     same_visits(read_visit_list(path), visits)
 
 
+@pytest.mark.parametrize(
+    "spreadsheet",
+    [
+        lambda text: "\ufeff" + text,
+        lambda text: text.replace(",", ";"),
+        lambda text: text.replace(",", "\t"),
+        lambda text: "# of a night, by hand\n\n" + text,
+    ],
+    ids=["byte order mark", "semicolons", "tabs", "comment"],
+)
+def test_tables_of_spreadsheets(visits, write_list, spreadsheet):
+    path = write_list()
+    path.write_text(spreadsheet(path.read_text()), encoding="utf-8")
+    again = read_visit_list(path)
+    assert again.digest == visits.digest
+    assert again.visit.tolist() == visits.visit.tolist()
+
+
 def test_headers_of_instance_catalogues(visits, tmp_path):
     path = tmp_path / "instcat.txt"
     header = {
@@ -338,6 +359,7 @@ def changed(name, index, value):
         (changed("fieldDec", 0, 95.0), "visit 1001: fielddec = 95 deg: expected -90 to 90 deg"),
         (changed("visitExposureTime", 0, -3.0), "visit 1001: visitexposuretime = -3 s: expected a time above 0 s"),
         (changed("observationId", 1, 3.5), "expected whole numbers from 0"),
+        (changed("fieldRA", 1, "12h"), "column fieldra, row 2: '12h': expected a number"),
     ],
 )
 def test_values_that_cannot_be(write_list, changes, message):
@@ -367,6 +389,16 @@ def test_files_that_are_no_list(tmp_path, write_database):
         read_visit_list(text)
     with pytest.raises(ProductError, match="cannot be read"):
         read_visit_list(tmp_path / "none.db")
+    words = tmp_path / "words.csv"
+    words.write_text("these are words\n1\n")
+    with pytest.raises(ProductError, match=r"no column of the .*: expected one of .*; columns are these are words"):
+        read_visit_list(words)
+    two = tmp_path / "two.db"
+    with closing(sqlite3.connect(two)) as connection:
+        connection.execute("CREATE TABLE a (ra)")
+        connection.execute("CREATE TABLE b (ra)")
+    with pytest.raises(ProductError, match=r"no table of visits: expected observations, .*; tables are a, b"):
+        read_visit_list(two)
     broken = tmp_path / "broken.db"
     broken.write_bytes(b"SQLite format 3\x00" + bytes(200))
     with pytest.raises(ProductError, match="cannot be read"):
