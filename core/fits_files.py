@@ -6,6 +6,7 @@ import bz2
 import gzip
 import io
 import lzma
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -39,7 +40,8 @@ def open_fits(
     to 1 GiB and to the memory that is free: a few bytes can stand for as many gigabytes. Other options are those of
     ``astropy.io.fits.open``.
 
-    Raises `error` where it unpacks to more; whatever astropy raises for a damaged file passes.
+    Raises `error` where it unpacks to more; whatever astropy raises for a damaged file passes, its warning of one cut
+    short among them.
     """
     from astropy.io import fits  # few prescriptions have a grid, and it takes long to import
 
@@ -47,11 +49,19 @@ def open_fits(
         require_file(path, error)
     with open(path, "rb") if content is None else io.BytesIO(content) as packed:
         stream = _unpacked(path, packed, error)
-        with fits.open(packed if stream is None else stream, **options) as hdus:
+        with _short_files_refused(), fits.open(packed if stream is None else stream, **options) as hdus:
             for hdu in hdus:
                 if isinstance(hdu, fits.CompImageHDU):
                     _require_room(path, hdu, error)
             yield hdus
+
+
+@contextmanager
+def _short_files_refused() -> Iterator[None]:
+    """Raise astropy's warning of a file cut short, which it opens all the same."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*truncated.*")
+        yield
 
 
 def unpacked_bytes(path: Path, data: bytes, error: type[PachonError]) -> bytes:

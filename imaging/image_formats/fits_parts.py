@@ -74,7 +74,6 @@ def _opened(path: Path, **options: Any) -> Iterator[fits.HDUList]:
     """Open a file; cards beyond the standard, which many observatories write, are no error."""
     with warnings.catch_warnings(), parsing(path, "damaged or not FITS", ProductError):
         warnings.simplefilter("ignore", AstropyWarning)
-        warnings.filterwarnings("error", message=".*truncated.*")
         with open_fits(path, ProductError, lazy_load_hdus=False, **options) as hdus:
             yield hdus
 

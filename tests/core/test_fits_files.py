@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.utils.exceptions import AstropyUserWarning
 
 import pachon
 from pachon.core import fits_files
@@ -77,6 +78,13 @@ def test_bombs_are_refused(bomb, reader, monkeypatch):
     monkeypatch.setattr(fits_files, "_UNPACKED", fits_files._UNPACKED // 10)
     with pytest.raises(PachonError, match=r"bomb\.fits: compressed file of 0\.0 MB .* unpack it"):
         READERS[reader](bomb)
+
+
+def test_a_file_cut_short_is_an_error(tmp_path):
+    path = tmp_path / "short.fits"
+    path.write_bytes(image_bytes(tmp_path)[:-2880])
+    with pytest.raises(AstropyUserWarning, match="truncated"), open_fits(path, ProductError):
+        pass
 
 
 def test_what_is_compressed_twice_is_refused(tmp_path):
