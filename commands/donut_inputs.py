@@ -117,7 +117,8 @@ class StampFiles:
                 (a is None) == (b is None) and (a is None or b is None or abs(a - b) < _SAME_ANGLE)
                 for a, b in zip(*angles, strict=True)
             )
-            if (first.camera, first.band) != (header.camera, header.band) or not same:
+            instrument = [(h.camera, h.band, h.telescope, h.pixel) for h in (first, header)]
+            if instrument[0] != instrument[1] or not same:
                 text = f"{header.text or 'no header'}: expected that of {self.paths[0]}, {first.text or 'no header'}"
                 raise ProductError(f"{text}; give files of one exposure", file=path)
             if not (first.wavelength is None or np.isclose(first.wavelength, header.wavelength or 0.0)):

@@ -64,7 +64,7 @@ def donuts_command(
             "--telescope",
             "-t",
             metavar="MODEL",
-            help="Bundled model, or path; that of the headers' camera and band, or lsst_v3.3_r.",
+            help="Bundled model, or path; that of the header, of its camera and band, or lsst_v3.3_r.",
             rich_help_panel=_TELESCOPE,
         ),
     ] = None,
@@ -300,12 +300,14 @@ def donuts_command(
     from ..wavefront.atmosphere.atmosphere import Atmosphere
 
     if simulate:
-        side = (pixel_um or DEFAULT_PIXEL_UM) * 1e-6
+        name = telescope or DEFAULT_TELESCOPE
+        focused = load_model(name, lenient, glass_catalogue or ())
+        side = _pixel_um(pixel_um, None, focused.camera) * 1e-6
         detector = DonutDetector(side, defocus=1e-6 * defocus_um, moved=moved or DETECTOR)
         air = DonutAir(outer_scale=outer_scale_m)
         simulate_file(
             files,
-            load_model(telescope or DEFAULT_TELESCOPE, lenient, glass_catalogue or ()),
+            (name, focused),
             DonutModel(air=air, detector=detector),
             (perturb or [], settings or []),
             wavelength_nm,
@@ -341,7 +343,7 @@ def donuts_command(
     model = DonutModel(
         air=DonutAir(outer_scale=outer_scale_m, atmosphere=atmosphere),
         detector=DonutDetector(
-            _pixel_um(pixel_um, header) * 1e-6,
+            _pixel_um(pixel_um, header.pixel, header.camera) * 1e-6,
             defocus=inputs.defocus + inputs.heights + 1e-6 * defocus_um,
             moved=moved or files_read.moved() or DETECTOR,
             saturation=saturation,
@@ -416,13 +418,15 @@ def _electrons(gain: float | None, header: HeaderValues) -> float:
     return gain
 
 
-def _pixel_um(pixel_um: float | None, header: HeaderValues) -> float:
-    """Return the side of a pixel [um]: of the option, the camera of the header, or that of the LSST."""
+def _pixel_um(pixel_um: float | None, stated: float | None, camera: str | None) -> float:
+    """Return the side of a pixel [um]: of the option, that stated [m], of the camera, or that of the LSST."""
     from ..models.camera.cameras import load_camera
 
     if pixel_um is not None:
         return pixel_um
-    return DEFAULT_PIXEL_UM if header.camera is None else 1e6 * load_camera(header.camera).pixel_size
+    if stated is not None:
+        return 1e6 * stated
+    return DEFAULT_PIXEL_UM if camera is None else 1e6 * load_camera(camera).pixel_size
 
 
 def _output_kind(table: Path | None, picture: Path | None) -> str:

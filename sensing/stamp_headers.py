@@ -40,6 +40,8 @@ _HORIZON_KEYS = (("BORE-AZ", "BORE-ALT"), ("AZSTART", "ELSTART"), ("AZ", "EL"))
 _ROTATION_KEYS = ("ROTPA", "BORE-ROTANG")
 #: Latitude of Cerro Pachon, where a header has none [deg].
 _LATITUDE = -30.244639
+#: Keywords of simulated donuts: telescope, wavelength [nm], pixel [um].
+TELESCOPE_KEY, WAVELENGTH_KEY, PIXEL_KEY = "TELMODEL", "WAVELEN", "PIXEL_UM"
 #: Keywords that are copied from header to header.
 _KEYWORD = re.compile(r"[A-Z0-9_-]+( [A-Z0-9_-]+)*")
 #: Mean wavelength and width [angstrom] at the end of DECam's names of filters.
@@ -64,6 +66,10 @@ class HeaderValues:
         Mean wavelength of the filter [m], where the header has it.
     gain : float or None
         Electrons of a unit of the images.
+    telescope : str or None
+        Bundled telescope, or path, of which simulated donuts are believed to be.
+    pixel : float or None
+        Side of their pixels [m].
     """
 
     camera: str | None = None
@@ -72,10 +78,14 @@ class HeaderValues:
     band: str | None = None
     wavelength: float | None = None
     gain: float | None = None
+    telescope: str | None = None
+    pixel: float | None = None
 
     @property
     def model(self) -> str | None:
-        """Name of the bundled telescope of the camera and band; None where it is not known."""
+        """Name of the telescope: that stated, or the bundled one of camera and band; None where it is not known."""
+        if self.telescope is not None:
+            return self.telescope
         if self.camera == "lsst":
             return f"rubin_v3.14_{self.band}" if self.band in set("ugrizy") else None
         return None if self.camera is None else {"comcam": "comcam_r"}.get(self.camera, self.camera)
@@ -85,7 +95,7 @@ class HeaderValues:
         """What is known, in one line; empty without anything."""
         angles = {"rotator": self.rotator, "parallactic angle": self.parallactic_angle}
         parts = [
-            *([self.camera] if self.camera else []),
+            *(word for word in (self.camera, self.telescope) if word),
             *([f"band {self.band}"] if self.band else []),
             *(f"{name} {np.rad2deg(angle):.4g} deg" for name, angle in angles.items() if angle is not None),
             *([f"gain {self.gain:.4g}"] if self.gain is not None else []),
@@ -113,7 +123,12 @@ def header_values(headers: Iterable[fits.Header], file: Path) -> HeaderValues:
             # Images' +y has the position angle q - rotator - 90 deg.
             rotator = float(np.remainder(parallactic - rotation - 0.5 * np.pi + np.pi, 2.0 * np.pi) - np.pi)
     gain = next((g for h in listed if (g := _gain(h, file)) is not None), None)
-    return HeaderValues(camera, rotator, parallactic, band, wavelength, gain)
+    simulated = next((h for h in listed if TELESCOPE_KEY in h), None)
+    if simulated is None:
+        return HeaderValues(camera, rotator, parallactic, band, wavelength, gain)
+    telescope, pixel = str(simulated[TELESCOPE_KEY]).strip(), 1e-6 * _number(simulated, PIXEL_KEY, file)
+    wavelength = 1e-9 * _number(simulated, WAVELENGTH_KEY, file)
+    return HeaderValues(camera, rotator, parallactic, band, wavelength, gain, telescope, pixel)
 
 
 def detector_of(header: fits.Header) -> str | int | None:

@@ -27,6 +27,7 @@ from ...models.camera.photometry import READ_NOISE
 from ...models.parameters.parameters import Parameter, apply
 from ...models.telescope import Telescope
 from ...sensing.model import DonutModel
+from ...sensing.stamp_headers import PIXEL_KEY, TELESCOPE_KEY, WAVELENGTH_KEY
 from ...wavefront.corner_stars import corner_stars
 from ...wavefront.psf.stamps import Stamps
 from ...wavefront.request import wavelength_points
@@ -78,12 +79,15 @@ class SimulatedDonuts:
         Shift of the body that moves [m].
     zernikes : ndarray, shape [n, 19]
         Z4 to Z22 beyond the telescope that is believed in [m].
+    wavelength : float
+        Mean wavelength [m].
     """
 
     images: np.ndarray
     fields: np.ndarray
     defocus: np.ndarray
     zernikes: np.ndarray
+    wavelength: float
 
 
 def changed_telescope(telescope: Telescope, changes: Sequence[str]) -> Telescope:
@@ -165,11 +169,11 @@ def simulate_donuts(
         wavefront_zernikes(t, fields, float(waves[len(waves) // 2]), jmax=int(_NOLL[-1])).coefficients
         for t in (telescope, true)
     )
-    return SimulatedDonuts(images, fields, defocus, (after - before)[:, _NOLL - 1])
+    return SimulatedDonuts(images, fields, defocus, (after - before)[:, _NOLL - 1], float(waves.mean()))
 
 
 def write_donuts(path: Path, donuts: SimulatedDonuts, scene: DonutScene, model: DonutModel, telescope: str) -> None:
-    """Write simulated donuts as a FITS file that ``pachon donuts`` reads."""
+    """Write simulated donuts of a telescope as a FITS file that ``pachon donuts`` reads."""
     columns: dict[str, tuple[np.ndarray | list[str], str, str]] = {
         "field_x": (np.rad2deg(donuts.fields[:, 0]), "deg", "field angle along x"),
         "field_y": (np.rad2deg(donuts.fields[:, 1]), "deg", "field angle along y"),
@@ -184,9 +188,10 @@ def write_donuts(path: Path, donuts: SimulatedDonuts, scene: DonutScene, model: 
     cube = fits.PrimaryHDU(donuts.images)
     cards: Mapping[str, tuple[object, str]] = {
         "BUNIT": ("electron", "sky subtracted"),
-        "MODEL": (telescope, "telescope that is believed in"),
+        TELESCOPE_KEY: (telescope, "telescope that is believed in"),
+        WAVELENGTH_KEY: (1e9 * donuts.wavelength, "mean wavelength [nm]"),
         "MOVED": (model.detector.moved, "what the defocus moved"),
-        "PIXEL_UM": (1e6 * model.detector.pixel(), "side of a pixel [um]"),
+        PIXEL_KEY: (1e6 * model.detector.pixel(), "side of a pixel [um]"),
         "SKYVAR": (scene.sky + scene.read_noise**2, "variance of sky and readout [electron^2]"),
         "SEEING": (scene.seeing_arcsec, "FWHM of the long exposure [arcsec]"),
         "SEED": (scene.seed, "seed of all random numbers"),
