@@ -31,7 +31,7 @@ _PROMISING = 0.2
 #: Gain over the largest one from which on other rims are tried, too.
 _LIKELY = 0.4
 #: Loss by which fits with other rims are no worse: each of these may be the one that moved.
-_ALIKE = 9.0
+_ALIKE = 16.0
 #: Most rims that are freed.
 MOST_BODIES = 4
 #: Rims that are tried in vain before the search ends.

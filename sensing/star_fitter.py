@@ -47,6 +47,8 @@ _MUCH_SHARPER = 0.5
 _SHARED = 2.0
 #: Cells across the pupil over those that are needed.
 _ENOUGH = 1.25
+#: Cells across the pupil from which on those on rims leave less chi-square than rims that explain an image alike.
+_FOR_RIVALS = 120
 #: Noll indices without which rims are not searched for.
 _TERMS_FOR_RIMS = np.arange(4, 23)
 
@@ -250,8 +252,13 @@ class StarFitter:
             fine, best = finer, self.solve(finer.stamp, best.stars[0], best.shared, steps=steps)
         assert fine is not None
         if self.searches_rims:
-            begun = RimFit(self._light, fine.stamp, best, rivals)
-            fit = finished(self.instrument, begun, 0.0, self.rim_solver(FINE, fine.of))
+            fit = RimFit(self._light, fine.stamp, best, rivals)
+            fit = finished(self.instrument, fit, 0.0, self.rim_solver(FINE, fine.of))
+            if fit.rivals and fine.sampling.across < _FOR_RIVALS:
+                fine = replace(fine, sampling=replace(fine.sampling, across=_FOR_RIVALS))
+                solved = self.rim_solver(FINE, fine.of)
+                finer_fit = replace(solved(fit.light, fit.solution), rivals=fit.rivals)
+                fit = finished(self.instrument, finer_fit, 0.0, solved)
             if fit.solution.converged or not best.converged:
                 star = self.with_light(fit.light)._clipped(replace(fine, stamp=fit.stamp), fit.solution)
                 return replace(star, rivals=tuple(self._rival(rival, fit.solution.loss) for rival in fit.rivals))
