@@ -132,13 +132,16 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
             speckles, turbulence = (strength * values for values in beside.air(photons))
             lacking, air = lacking + speckles[:n_star, :n_star], air + turbulence[wavefront, wavefront]
             speckled = speckles[wavefront, wavefront]
-    accuracy, of_residuals = model_floor(solution.shared[:n]), residuals[wavefront, wavefront] + _by_rivals(star, n)
+    accuracy, of_residuals = model_floor(solution.shared[:n]), residuals[wavefront, wavefront] + by_rivals(star, n)
     parts = ErrorParts.of(photons[wavefront, wavefront], of_residuals, air, figure + accuracy)
     return StarErrors(lacking, parts, parts.photons + parts.residuals + speckled + accuracy, figure)
 
 
-def _by_rivals(star: StarSolution, n: int) -> np.ndarray:
-    """Return the mean square of what fits with other rims free differ by, weighted by their likelihoods, [n, n]."""
+def by_rivals(star: StarSolution, n: int) -> np.ndarray:
+    """Return the covariance of the first n terms by which rims moved, where fits with several explain a star alike.
+
+    It is the mean square of their differences from the best fit, weighted by their likelihoods.
+    """
     likelihoods = np.exp([-0.5 * rival.worse for rival in star.rivals])
     differences = np.array([rival.wave[:n] - star.solution.shared[:n] for rival in star.rivals]).reshape(-1, n)
     weighted = differences * likelihoods[:, None] / (1.0 + likelihoods.sum())
