@@ -14,6 +14,7 @@ from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y
 from .light import Instrument, StarLight
 from .likelihood import Stamp, model_image
 from .neighbours import NeighbourSearch, explains_more
+from .rim_search import MOST_BODIES, RimFit, RimSolver, settled, with_another_rim
 from .sides import CONTRADICTED, BothSides, SideFit
 from .solve import COARSE, FINE, Solution
 from .stamps import Pixels, plane_basis
@@ -133,13 +134,13 @@ def fit_star(
     if donut and explained and _other_focus_is_better(search.fitter, search.start, search.best, mirrored):
         return StarFit(DonutFlag.DEFOCUS_SIGN, sides=sides)
     if fitter.searches_rims:
-        search = _search_of_rims(search.fitter, search)
+        search = _search_of_rims(fitter, search)
     fitter, start, best = search.fitter, search.start, search.best
     if not _explained(start.stamp, best):
         return StarFit(DonutFlag.NO_DONUT)
     if fitter.lost_light(start.stamp, best).any_pixel > _LOST:
         return StarFit(DonutFlag.MOSTLY_LOST)
-    return _finished(fitter, pixels, best, sides, sky_level)
+    return _finished(fitter, pixels, best, sides, sky_level, search.rivals)
 
 
 class CoarseFit(NamedTuple):
@@ -169,11 +170,16 @@ def _started(fitter: StarFitter) -> tuple[StarFitter, Start]:
 
 
 def _finished(
-    fitter: StarFitter, pixels: Pixels, best: Solution, sides: BothSides | None, sky_level: float | None
+    fitter: StarFitter,
+    pixels: Pixels,
+    best: Solution,
+    sides: BothSides | None,
+    sky_level: float | None,
+    rivals: tuple[RimFit, ...] = (),
 ) -> StarFit:
-    """Return the outcome of a fit of all pixels from the solution of a search."""
+    """Return the outcome of a fit of all pixels from the solution of a search and its rivals."""
     flags = DonutFlag.OK
-    finest = fitter.finest(best)
+    finest = fitter.finest(best, rivals)
     if (finest.full.used != pixels.used).any():
         flags |= DonutFlag.CLIPPED
     if any(body.moved for body in finest.light.free_rims.bodies):
@@ -198,12 +204,13 @@ def _finished(
 
 @dataclass(frozen=True)
 class _Search:
-    """Best coarse solution, from a start, on the pixels of a fitter, and that without neighbours."""
+    """Best coarse solution, from a start, on the pixels of a fitter, that without neighbours, and fits as good."""
 
     fitter: StarFitter
     start: Start
     best: Solution
     single: Solution
+    rivals: tuple[RimFit, ...] = ()
 
     @property
     def misfit(self) -> float:
@@ -229,23 +236,61 @@ def _search(fitter: StarFitter, start: Start) -> _Search:
     return search
 
 
-def _search_of_rims(fitter: StarFitter, search: _Search) -> _Search:
+def _search_of_rims(begun: StarFitter, search: _Search) -> _Search:
     """Return a search with rims free that the residuals say stand elsewhere, if it explains more.
 
     Neighbours are quicker to find, so that they are searched for first; but light beside a rim looks like one, and
-    like a cosmic ray, so that rims are searched for without those.
+    like a cosmic ray, so that rims are searched for without those. Pixels of the fitter that has begun are used again
+    where the model with these rims explains them.
     """
     if search.misfit <= _MISFIT:
         return search
-    start = search.start
-    solved = fitter.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, start.pixels))
-    fitter, stamp, best = fitter.with_moved_rims(start.stamp, search.single, _MISFIT, solved, start.unknowns)
-    if not best.loss < search.best.loss:
+    found, first = replace(search, best=search.single), search.start.unknowns
+    begin: Solution | None = replace(search.single, stars=(first,), shared=np.zeros_like(search.single.shared))
+    for _ in range(MOST_BODIES):
+        another = _with_another_rim(found, begin)
+        if another is found:
+            break
+        found, begin = _with_explained_pixels(begun, another), None
+    if not found.misfit < search.misfit:
         return search
-    trial = _Search(fitter, replace(start, stamp=stamp), best, best)
-    if trial.misfit > _MISFIT and fitter.instrument.model.neighbours:
-        trial = replace(trial, best=_with_neighbours(fitter, trial.start, best))
-    return trial
+    if found.misfit > _MISFIT and begun.instrument.model.neighbours:
+        return replace(found, best=_with_neighbours(found.fitter, found.start, found.best))
+    return found
+
+
+def _with_another_rim(search: _Search, first: Solution | None) -> _Search:
+    """Return a search with one more rim free, from the unknowns where the search began; the same without one."""
+    fitter, start = search.fitter, search.start
+    fit = RimFit(fitter.light, start.stamp, search.best, search.rivals)
+    found = with_another_rim(fitter.instrument, fit, _MISFIT, _coarse_solver(fitter, start), first)
+    return search if found is fit else _of_rims(fitter, start, found)
+
+
+def _with_explained_pixels(begun: StarFitter, search: _Search) -> _Search:
+    """Return a search with those pixels that were left out before its rims were free, and are not far off its model."""
+    fitter, best = search.fitter, search.best
+    explained = begun.with_light(fitter.light).without_outliers(best.stars[0], best.waves[0])
+    used = fitter.clean.used | explained
+    if (used == fitter.clean.used).all():
+        return search
+    fitter = begun.with_light(fitter.light).with_used(used)
+    start = fitter.start()
+    best = fitter.solve(start.stamp, best.stars[0], best.shared, COARSE)
+    fit = RimFit(fitter.light, start.stamp, best, search.rivals)
+    return _of_rims(fitter, start, settled(fitter.instrument, fit, _coarse_solver(fitter, start)))
+
+
+def _coarse_solver(fitter: StarFitter, start: Start) -> RimSolver:
+    """Return the function that fits light with its rims elsewhere to the pixels of a start."""
+    return fitter.rim_solver(COARSE, lambda moved: moved.stamp(moved.light, start.pixels))
+
+
+def _of_rims(fitter: StarFitter, start: Start, fit: RimFit) -> _Search:
+    """Return the search of a fit of other rims to the pixels of a start."""
+    return _Search(
+        fitter.with_light(fit.light), replace(start, stamp=fit.stamp), fit.solution, fit.solution, fit.rivals
+    )
 
 
 def _masked_search(fitter: StarFitter, search: _Search) -> _Search:

@@ -24,8 +24,8 @@ from .inputs import noll_indices
 from .light import Instrument
 from .moving_rims import FreeRims
 from .pupil_cells import PupilCells
-from .shared_rims import cells_across, light_with, moved_rims_of_all, shared_rims
-from .solve import Group, solve
+from .shared_rims import cells_across, group_with_rims, light_with, moved_rims_of_all, shared_rims
+from .solve import solve
 from .star_errors import by_residuals
 from .star_fitter import StarSolution
 from .vignetting import cells_with_rims, rim_shifts
@@ -88,9 +88,8 @@ class TelescopeFreedoms(WavefrontFit):
         count, rims, slopes = len(freedoms), shared_rims(instrument, usable.stars), instrument.slope_spreads
         first = count + len(slopes)
         shifts = self._rim_shifts(usable, spreads)
-        maps = [
-            block_diag(np.concatenate([np.eye(count), of_star]), np.eye(len(slopes) + len(rims))) for of_star in shifts
-        ]
+        maps = [block_diag(np.concatenate([np.eye(count), of_star]), np.eye(len(slopes))) for of_star in shifts]
+        precision = np.concatenate([spreads, slopes]) ** -2.0
         shared, unknowns = usable.start(response.matrix[:, noll - 1], spreads**-2.0), usable.unknowns
         shared = np.append(shared, 0.0 * slopes)
         for _ in range(_OUTER):
@@ -98,15 +97,7 @@ class TelescopeFreedoms(WavefrontFit):
                 self._with_vignetting(instrument, star, rims, shared[:count], star_shifts @ shared[:count])
                 for star, star_shifts in zip(usable.stars, shifts, strict=True)
             ]
-            group = Group(
-                tuple(star.stamp for star in stars),
-                maps,
-                np.concatenate([spreads, slopes, rims.spreads]) ** -2.0,
-                instrument.known_seeing,
-                transient=True,
-                prior_mean=np.concatenate([np.zeros(first), -rims.values[rims.free]]),
-                limits=np.concatenate([np.full(first, np.inf), rims.limits]),
-            )
+            group = group_with_rims(instrument, stars, maps, precision, rims, transient=True)
             start = np.concatenate([shared, np.zeros(len(rims))])
             joint = solve(group, unknowns, start, steps=_INNER, pool=pool)
             change, shared, unknowns = joint.shared - start, joint.shared[:first], list(joint.stars)

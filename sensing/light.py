@@ -386,7 +386,7 @@ class StarLight:
     @property
     def shift_mean(self) -> np.ndarray:
         """Means of the priors of the shifts, from where the telescope has the rims, shape [n_shift]."""
-        return np.concatenate([np.zeros(self.before_free_rims), -self.free_rims.values[self.free_rims.free]])
+        return np.concatenate([np.zeros(self.before_free_rims), self.free_rims.means])
 
     @property
     def shift_limit(self) -> np.ndarray:

@@ -116,6 +116,11 @@ class FreeRims:
         return np.array([body.spreads for body in self.bodies]).reshape(-1, MOTIONS)[self.free]
 
     @property
+    def means(self) -> np.ndarray:
+        """Means of the priors of further free motions, shape [n]: the rims are believed to be where prescribed."""
+        return -self.values[self.free]
+
+    @property
     def limits(self) -> np.ndarray:
         """Largest free motions from the prescription, shape [n]: residuals of other causes would move sizes far."""
         limits = [np.where(body.moved, np.inf, _MOST * np.array(body.spreads)) for body in self.bodies]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -27,13 +27,13 @@ _FEWEST_SQUARES = 50
 #: is larger than given, a rim explains a tenth or two by chance.
 _MISFIT = 0.5
 #: Part of the misfit that a score test gives a rim that is tried: one that stands far off gains more in the end.
-_PROMISING = 0.5
+_PROMISING = 0.2
 #: Gain over the largest one from which on other rims are tried, too.
 _LIKELY = 0.4
-#: Loss by which fits with other rims are no worse: these are then free together.
-_ALIKE = 9.0
+#: Loss by which fits with other rims are no worse: each of these may be the one that moved.
+_ALIKE = 16.0
 #: Most rims that are freed.
-_MOST_BODIES = 4
+MOST_BODIES = 4
 #: Rims that are tried in vain before the search ends.
 _MOST_FAILURES = 2
 #: Gain of a rim from afar over that which is needed, up to which it is not tried from where the fit has got to.
@@ -45,8 +45,6 @@ _FINISHED = 2
 _OUTER = 6
 #: Loss over that of the best from which on they are not.
 _CLOSE = 2.0
-#: Change of the loss, in units of that of a pixel, with which they end.
-_SETTLED = 1.0
 #: Fraction of a step that is not shortened further.
 _SHORTEST = 0.2
 #: Shift of a shadow over the side of a cell that is small enough to be linear.
@@ -55,11 +53,15 @@ _SMALL = 0.05
 
 @dataclass(frozen=True)
 class RimFit:
-    """Light of a star with its rims, the pixels it is compared with, and the best unknowns."""
+    """Light of a star with its rims, the pixels it is compared with, and the best unknowns.
+
+    Rivals are fits with other rims free that are no worse but by chance.
+    """
 
     light: StarLight
     stamp: Stamp
     solution: Solution
+    rivals: tuple[RimFit, ...] = ()
 
 
 class RimSolver(Protocol):
@@ -72,14 +74,14 @@ class RimSolver(Protocol):
         """
 
 
-def with_moved_rims(
+def with_another_rim(
     instrument: Instrument,
     best: RimFit,
     noise: float,
     solved: RimSolver,
     first: Solution | None = None,
 ) -> RimFit:
-    """Return the fit with rims free that the residuals say stand elsewhere.
+    """Return the fit with one more rim free if the residuals say that it stands elsewhere, or the same fit.
 
     Parameters
     ----------
@@ -96,15 +98,13 @@ def with_moved_rims(
         rims are held has taken up where they stand.
     """
     failed: list[RimBody] = []
-    while sum(body.moved for body in best.light.free_rims.bodies) < _MOST_BODIES and len(failed) < _MOST_FAILURES:
-        loss = best.solution.loss / best.stamp.used.sum()
-        if loss < noise:
-            break
+    free = [body for body in best.light.free_rims.bodies if body.moved]
+    loss = best.solution.loss / best.stamp.used.sum()
+    while len(free) < MOST_BODIES and len(failed) < _MOST_FAILURES and loss >= noise:
         misfit = _MISFIT * max(loss - (noise or 1.0), 0.0) * best.stamp.used.sum()
         least = _GAIN * _correlation(best)
         threshold = least + misfit
         bodies, gains = rim_gains(instrument, best)
-        free = [body for body in best.light.free_rims.bodies if body.moved]
         moved = {body.members for body in (*free, *failed)}
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
         if not gains.max(initial=0.0) > least + _PROMISING * misfit:
@@ -117,24 +117,35 @@ def with_moved_rims(
             )
         else:
             trials = _each_freed(instrument, best, bodies, first, solved, limit)
-        trial = trials[0]
-        gain = best.solution.loss - trial.solution.loss
-        if gain < threshold:
-            if first is None:
-                failed += itertools.compress(bodies, likely)
-            elif gain < _SHORT * threshold:
-                break
-            first = None
-            continue
-        first, failed = None, []
-        for rival in trials[1:]:
-            if rival.solution.loss - trial.solution.loss < _ALIKE:
-                # Either may have moved: both are free.
-                rims = trial.light.free_rims.with_body(rival.light.free_rims.bodies[-1])
-                light = trial.light.with_free_rims(rims, instrument.middle)
-                trial = _settled(instrument, solved(light, trial.solution), solved)
-        best = trial
+        gain = best.solution.loss - trials[0].solution.loss
+        if gain >= threshold:
+            return _best_of(trials)
+        if first is None:
+            failed += itertools.compress(bodies, likely)
+        elif gain < _SHORT * threshold:
+            break
+        first = None
     return best
+
+
+def finished(instrument: Instrument, fit: RimFit, noise: float, solved: RimSolver) -> RimFit:
+    """Return the fit with all shadows where its rims are found to stand, and all rims free that the residuals say.
+
+    Arguments are those of :func:`with_another_rim`. Rivals are fitted as well, and the best of all is returned.
+    """
+    if fit.light.free_rims.bodies:
+        fits = [fit, *(solved(rival.light, rival.solution) for rival in fit.rivals)]
+        fit = _best_of([settled(instrument, trial, solved) for trial in fits])
+    while (another := with_another_rim(instrument, fit, noise, solved)) is not fit:
+        fit = another
+    return fit
+
+
+def _best_of(fits: Sequence[RimFit]) -> RimFit:
+    """Return the best fit, with those that are no worse but by chance as its rivals."""
+    best, *others = sorted(fits, key=lambda fit: fit.solution.loss)
+    alike = [replace(fit, rivals=()) for fit in others if fit.solution.loss - best.solution.loss < _ALIKE]
+    return replace(best, rivals=tuple(alike))
 
 
 def _correlation(fit: RimFit) -> float:
@@ -179,10 +190,10 @@ def _each_freed(
     for body in bodies:
         light = fit.light.with_free_rims(fit.light.free_rims.with_body(body), instrument.middle)
         # A rim that stands far off gains little before its shadow is computed where it is first found to stand.
-        trials.append(_settled(instrument, solved(light, start), solved, _FIRST_STEPS, limit))
+        trials.append(settled(instrument, solved(light, start), solved, _FIRST_STEPS, limit))
     trials.sort(key=lambda trial: trial.solution.loss)
     close = [trial for trial in trials if trial.solution.loss < _CLOSE * trials[0].solution.loss]
-    finished = [_settled(instrument, trial, solved) for trial in close[:_FINISHED]]
+    finished = [settled(instrument, trial, solved) for trial in close[:_FINISHED]]
     return sorted(finished, key=lambda trial: trial.solution.loss)
 
 
@@ -228,26 +239,36 @@ def rim_gains(instrument: Instrument, fit: RimFit) -> tuple[list[RimBody], np.nd
     return bodies, gains
 
 
-def _settled(
+def settled(
     instrument: Instrument, best: RimFit, solved: RimSolver, steps: int = _OUTER, hopeless: float = np.inf
 ) -> RimFit:
     """Return the best fit with the same rims free, their shadows where they are found to stand, after so many steps.
 
     Steps end where the loss cannot get below a `hopeless` one.
     """
-    first = len(instrument.noll) + best.light.before_free_rims
     factor = 1.0
     for _ in range(steps):
-        rims, shift = best.light.free_rims, factor * best.solution.waves[0][first:]
-        if np.all(np.abs(shift) < _SMALL * rims.spreads):
+        rims, step = best.light.free_rims, _relative_step(instrument, best)
+        if np.all(np.abs(factor * step) < _SMALL):
             break
-        light = best.light.with_free_rims(rims.moved(shift), instrument.middle)
+        light = best.light.with_free_rims(rims.moved(factor * step * rims.spreads), instrument.middle)
         trial = solved(light, best.solution, hopeless)
         if trial.solution.loss > hopeless:
             break
-        # Light that a shadow uncovers lies beside the line that stands for it, so that steps may be too long.
-        gain = best.solution.loss - trial.solution.loss
-        best, factor = (trial, 1.0) if gain > 0.0 else (best, 0.5 * factor)
-        if factor < _SHORTEST or abs(gain) < _SETTLED * max(1.0, best.solution.loss / best.stamp.used.sum()):
+        # Light that a shadow uncovers lies beside the line that stands for it: steps may be too long, and the loss
+        # after one is not that of the rims there.
+        worse = trial.solution.loss - best.solution.loss
+        nearer = np.linalg.norm(_relative_step(instrument, trial)) < np.linalg.norm(step)
+        if worse < 0.0 or (nearer and worse < _ALIKE * max(1.0, best.solution.loss / best.stamp.used.sum())):
+            best, factor = replace(trial, rivals=best.rivals), 1.0
+        else:
+            factor *= 0.5
+        if factor < _SHORTEST:
             break
     return best
+
+
+def _relative_step(instrument: Instrument, fit: RimFit) -> np.ndarray:
+    """Return how far the rims of a fit are from their shadows, over their standard deviations."""
+    first = len(instrument.noll) + fit.light.before_free_rims
+    return np.asarray(fit.solution.waves[0][first:] / fit.light.free_rims.spreads)

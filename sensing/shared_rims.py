@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from .donut_rays import ZernikeRays
 from .image_model import STRENGTH
 from .light import Instrument, StarLight
 from .moving_rims import FreeRims, RimBody
 from .rim_table import MovedRim, rims_at
-from .solve import Solution
+from .solve import Group, Solution
 from .stamps import Pixels
 from .star_fitter import StarSolution
 
@@ -88,6 +89,44 @@ def with_shared_rims(instrument: Instrument, star: StarSolution, rims: FreeRims)
         stamp, full = (replace(s, grid=s.grid.with_rims(light.pupil_rims)) for s in (stamp, full))
     rays = instrument.rays(light, cells_across(instrument, star)).holding(held)
     return replace(star, light=light, stamp=replace(stamp, rays=rays), full=replace(full, rays=rays))
+
+
+def group_with_rims(
+    instrument: Instrument,
+    stars: Sequence[StarSolution],
+    maps: Sequence[np.ndarray],
+    precision: np.ndarray,
+    rims: FreeRims,
+    *,
+    transient: bool = False,
+) -> Group:
+    """Return stars as they are fitted together, the free motions of rims last among their shared unknowns.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        Telescope and model of the images.
+    stars : sequence of StarSolution
+        The stars, with the light of these rims.
+    maps : sequence of n_star ndarray, each of shape [n_wave, n_shared]
+        Unknowns of each star's wavefront by the other shared ones.
+    precision : ndarray, shape [n_shared]
+        Inverse variances of the priors of these, whose means are zero.
+    rims : FreeRims
+        Where the telescope has the rims.
+    transient : bool
+        As in :class:`~pachon.sensing.solve.Group`.
+    """
+    first = len(precision)
+    return Group(
+        tuple(star.stamp for star in stars),
+        [block_diag(of_star, np.eye(len(rims))) for of_star in maps],
+        np.concatenate([precision, rims.spreads**-2.0]),
+        instrument.known_seeing,
+        transient,
+        prior_mean=np.concatenate([np.zeros(first), rims.means]),
+        limits=np.concatenate([np.full(first, np.inf), rims.limits]),
+    )
 
 
 def moved_rims_of_all(

@@ -45,7 +45,7 @@ class ErrorParts:
     photons : ndarray
         Noise of the pixels, and terms that are fitted beside those asked for: the Cramer-Rao bound.
     residuals : ndarray
-        What the model lacks, by the power of the residuals beyond the noise.
+        What the model lacks, by the power of the residuals beyond the noise, and which rim moved if several may have.
     air : ndarray
         Mean wavefront of the turbulence of the exposure.
     floor : ndarray
@@ -132,9 +132,20 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
             speckles, turbulence = (strength * values for values in beside.air(photons))
             lacking, air = lacking + speckles[:n_star, :n_star], air + turbulence[wavefront, wavefront]
             speckled = speckles[wavefront, wavefront]
-    accuracy = model_floor(solution.shared[:n])
-    parts = ErrorParts.of(photons[wavefront, wavefront], residuals[wavefront, wavefront], air, figure + accuracy)
+    accuracy, of_residuals = model_floor(solution.shared[:n]), residuals[wavefront, wavefront] + by_rivals(star, n)
+    parts = ErrorParts.of(photons[wavefront, wavefront], of_residuals, air, figure + accuracy)
     return StarErrors(lacking, parts, parts.photons + parts.residuals + speckled + accuracy, figure)
+
+
+def by_rivals(star: StarSolution, n: int) -> np.ndarray:
+    """Return the covariance of the first n terms by which rims moved, where fits with several explain a star alike.
+
+    It is the mean square of their differences from the best fit, weighted by their likelihoods.
+    """
+    likelihoods = np.exp([-0.5 * rival.worse for rival in star.rivals])
+    differences = np.array([rival.wave[:n] - star.solution.shared[:n] for rival in star.rivals]).reshape(-1, n)
+    weighted = differences * likelihoods[:, None] / (1.0 + likelihoods.sum())
+    return np.asarray(weighted.T @ differences)
 
 
 def _most_air(instrument: Instrument, seeing: float) -> float:

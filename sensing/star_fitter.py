@@ -15,8 +15,9 @@ from .donut_rays import ZernikeRays
 from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y, STRENGTH, X, Y
 from .light import Instrument, Sampling, StarLight
 from .likelihood import Stamp, model_image, pulls
+from .moving_rims import FreeRims
 from .noise import measured_noise
-from .rim_search import RimFit, RimSolver, with_moved_rims
+from .rim_search import RimFit, RimSolver, finished
 from .solve import FINE, STEPS, Group, Solution, solve
 from .stamps import Match, Pixels, match_template, measured_variance
 
@@ -46,8 +47,19 @@ _MUCH_SHARPER = 0.5
 _SHARED = 2.0
 #: Cells across the pupil over those that are needed.
 _ENOUGH = 1.25
+#: Cells across the pupil from which on those on rims leave less chi-square than rims that explain an image alike.
+_FOR_RIVALS = 120
 #: Noll indices without which rims are not searched for.
 _TERMS_FOR_RIMS = np.arange(4, 23)
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Rims of another fit of a star, its unknowns of the wavefront, and its loss beyond that of the best one."""
+
+    rims: FreeRims
+    wave: np.ndarray
+    worse: float
 
 
 @dataclass(frozen=True)
@@ -68,6 +80,8 @@ class StarSolution:
         Best image of all pixels [electrons].
     errors : StarErrors, optional
         Errors of the fit by itself, of :mod:`.star_errors`, where they are at hand.
+    rivals : tuple of Rival
+        Fits with other rims free that are no worse but by chance.
     """
 
     light: StarLight
@@ -76,6 +90,7 @@ class StarSolution:
     solution: Solution
     model: np.ndarray
     errors: object = None
+    rivals: tuple[Rival, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -162,19 +177,6 @@ class StarFitter:
         fitter._set_light(light)
         return fitter
 
-    def with_moved_rims(
-        self,
-        stamp: Stamp,
-        best: Solution,
-        noise: float,
-        solved: RimSolver,
-        first: np.ndarray | None = None,
-    ) -> tuple[StarFitter, Stamp, Solution]:
-        """Return the fit with rims free that the residuals say stand elsewhere, with the stamp of its light."""
-        begun = None if first is None else replace(best, stars=(first,), shared=np.zeros_like(best.shared))
-        fit = with_moved_rims(self.instrument, RimFit(self._light, stamp, best), noise, solved, begun)
-        return self if fit.light is self._light else self.with_light(fit.light), fit.stamp, fit.solution
-
     def rim_solver(self, tolerance: float, stamp_of: Callable[[StarFitter], Stamp]) -> RimSolver:
         """Return the function that fits light with its rims elsewhere, from the unknowns of a solution."""
 
@@ -235,8 +237,11 @@ class StarFitter:
         """Return how many pixels are summed along each axis for the last fits in a seeing [rad]."""
         return self.instrument.binning(self._light, self.clean, fwhm) if self.donut else 1
 
-    def finest(self, coarse: Solution) -> StarSolution:
-        """Return the best model in pixels as fine as the seeing needs, without those far off it."""
+    def finest(self, coarse: Solution, rivals: tuple[RimFit, ...] = ()) -> StarSolution:
+        """Return the best model in pixels as fine as the seeing needs, without those far off it.
+
+        Rivals are coarse fits of other rims that are as good.
+        """
         best, blended, fine = coarse, len(coarse.stars[0]) > RATIO, None
         # The seeing of a solution decides how finely the next one is sampled.
         for _ in range(_SCALES):
@@ -247,11 +252,23 @@ class StarFitter:
             fine, best = finer, self.solve(finer.stamp, best.stars[0], best.shared, steps=steps)
         assert fine is not None
         if self.searches_rims:
-            solved = self.rim_solver(FINE, fine.of)
-            fitter, stamp, moved = self.with_moved_rims(fine.stamp, best, 0.0, solved)
-            if moved.converged or not best.converged:
-                return fitter._clipped(replace(fine, stamp=stamp), moved)
+            fit = RimFit(self._light, fine.stamp, best, rivals)
+            fit = finished(self.instrument, fit, 0.0, self.rim_solver(FINE, fine.of))
+            if fit.rivals and fine.sampling.across < _FOR_RIVALS:
+                fine = replace(fine, sampling=replace(fine.sampling, across=_FOR_RIVALS))
+                solved = self.rim_solver(FINE, fine.of)
+                finer_fit = replace(solved(fit.light, fit.solution), rivals=fit.rivals)
+                fit = finished(self.instrument, finer_fit, 0.0, solved)
+            if fit.solution.converged or not best.converged:
+                star = self.with_light(fit.light)._clipped(replace(fine, stamp=fit.stamp), fit.solution)
+                return replace(star, rivals=tuple(self._rival(rival, fit.solution.loss) for rival in fit.rivals))
         return self._clipped(fine, best)
+
+    def _rival(self, fit: RimFit, loss: float) -> Rival:
+        """Return a fit as a rival of one of another loss."""
+        noise = max(1.0, loss / fit.stamp.used.sum())
+        wave = fit.solution.waves[0][: len(self.instrument.noll)]
+        return Rival(fit.light.free_rims, wave, (fit.solution.loss - loss) / noise)
 
     def _clipped(self, fine: _Fine, best: Solution) -> StarSolution:
         """Return the best model without pixels far off it."""
@@ -290,7 +307,8 @@ class StarFitter:
         unknowns[[FLUX, BACKGROUND, SLOPE_X, SLOPE_Y]] /= unit
         stamp, full = rescaled(star.stamp), rescaled(star.full)
         best = self.solve(stamp, unknowns, star.solution.shared)
-        return StarSolution(self._light, stamp, full, best, model_image(full, best.stars[0], best.waves[0])), unit
+        model = model_image(full, best.stars[0], best.waves[0])
+        return replace(star, stamp=stamp, full=full, solution=best, model=model), unit
 
     def sampled(self, solution: Solution, blended: bool, last: _Fine | None) -> _Fine:
         """Return a stamp fine enough for the seeing of a solution: the last one if that is, nearly."""

@@ -27,8 +27,8 @@ from .inputs import noll_indices, small_length
 from .light import Instrument
 from .likelihood import Stamp, model_image
 from .rim_table import MovedRim
-from .shared_rims import moved_rims_of_all, settled, shared_rims, with_shared_rims
-from .solve import Group, Solution, solve
+from .shared_rims import group_with_rims, moved_rims_of_all, settled, shared_rims, with_shared_rims
+from .solve import Solution, solve
 from .star_errors import ErrorParts, air_of_terms, by_residuals, model_floor, star_errors, with_errors
 from .star_fitter import StarSolution
 from .terms import WavefrontTerms
@@ -274,14 +274,7 @@ class FieldTerms(WavefrontFit):
         rims = shared_rims(instrument, usable.stars)
         for _ in range(RIM_STEPS):
             stars = [with_shared_rims(instrument, star, rims) for star in usable.stars]
-            group = Group(
-                tuple(star.stamp for star in stars),
-                [block_diag(of_star, np.eye(len(rims))) for of_star in maps],
-                np.concatenate([precision, rims.spreads**-2.0]),
-                instrument.known_seeing,
-                prior_mean=np.concatenate([np.zeros(first), -rims.values[rims.free]]),
-                limits=np.concatenate([np.full(first, np.inf), rims.limits]),
-            )
+            group = group_with_rims(instrument, stars, maps, precision, rims)
             solution = solve(group, unknowns, np.concatenate([shared, np.zeros(len(rims))]), pool=pool)
             shared, unknowns = solution.shared[:first], list(solution.stars)
             if settled(rims, solution.shared[first:]):
