@@ -111,7 +111,7 @@ class ExposureDonuts(WavefrontFit):
     def refined(self, instrument: Instrument, stars: Sequence[StarSolution], fitted: FittedStars) -> Instrument | None:
         """Return terms with the higher ones of the air, if there is some, and rims that stand elsewhere for any star.
 
-        Such a rim is then free for all stars, where they have it together.
+        Such a rim is then free for all stars, where they have it together, unless these contradict it.
         """
         terms, rims = self._terms_with_air(instrument, fitted), FreeRims()
         if any(body.moved for star in stars for body in star.light.free_rims.bodies):

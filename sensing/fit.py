@@ -44,6 +44,7 @@ from .noise import PixelNoise, faint_level, measured_noise, smoothed
 from .result import DonutFit
 from .rim_amplitude import VOTERS, RimAmplitude, rim_amplitude, waves_fit_better
 from .rim_table import moved_rims, rim_table
+from .shared_rims import contradicted
 from .stamps import Pixels, central_slices
 from .star_errors import ErrorParts
 from .star_fitter import SMALLEST_DONUT, StarSolution
@@ -204,8 +205,12 @@ def fit_donuts(
         fitted = fitted_stars(instrument, by_rays, progress)
         refined = fit.refined(instrument, list(fitted.solutions.values()), fitted.results)
         if refined is not None:
-            instrument = refined
-            fitted = fitted_stars(instrument, {}, None)
+            again = fitted_stars(refined, {}, None)
+            if refined.free_rims.bodies and contradicted(fitted.solutions, again.solutions):
+                # Not the telescope's: each donut keeps the rims of its own fit.
+                refined = replace(refined, free_rims=instrument.free_rims)
+                again = fitted if refined.terms is instrument.terms else fitted_stars(refined, {}, None)
+            instrument, fitted = refined, again
     result = _result(instrument, observed, fitted)
     warn_of_other_hole(instrument, fitted.solutions, result)
     return result

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +17,9 @@ from .solve import Group, Solution
 from .stamps import Pixels
 from .star_fitter import StarSolution
 
+#: Rise of the loss of donuts that do not have a rim elsewhere by themselves, in units of that of a pixel, from which on
+#: they contradict it.
+_CONTRADICTED = 25.0
 #: Step of the rims over their standard deviations that is small enough to be linear.
 _SETTLED = 0.05
 
@@ -26,7 +29,8 @@ def shared_rims(instrument: Instrument, stars: Sequence[StarSolution]) -> FreeRi
     first: dict[tuple[tuple[int, int], ...], RimBody] = {}
     for star in stars:
         for body in star.light.free_rims.bodies:
-            first.setdefault(body.members, body)
+            if body.moved or body.members not in first:
+                first[body.members] = body
     rims = FreeRims()
     for body in first.values():
         rims = rims.with_body(body)
@@ -42,6 +46,23 @@ def shared_rims(instrument: Instrument, stars: Sequence[StarSolution]) -> FreeRi
         curvature[np.ix_(places, places)] += information - np.diag(star_rims.spreads**-2.0)
         gradient[places] += information @ values
     return rims.moved(np.linalg.lstsq(curvature, gradient, rcond=1e-12)[0]) if len(rims) else rims
+
+
+def contradicted(alone: Mapping[int, StarSolution], together: Mapping[int, StarSolution]) -> bool:
+    """Return whether stars without rims of their own elsewhere fit worse with those that others have.
+
+    Parameters
+    ----------
+    alone, together : mapping of int to StarSolution
+        Stars by their numbers, fitted by themselves, and again with rims free that are elsewhere in any of them.
+    """
+    rise = 0.0
+    for number in alone.keys() & together.keys():
+        before, after = alone[number], together[number]
+        if not any(body.moved for body in before.light.free_rims.bodies):
+            losses = [star.solution.loss / star.stamp.used.sum() for star in (before, after)]
+            rise += (losses[1] / losses[0] - 1.0) * after.stamp.used.sum()
+    return rise > _CONTRADICTED
 
 
 def _places(rims: FreeRims, star_rims: FreeRims) -> np.ndarray:
