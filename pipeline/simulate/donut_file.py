@@ -21,7 +21,7 @@ from ...core.products import write_hdus
 from ...core.random_streams import stream
 from ...core.schema import Count, NotNegative, Positive, Section, Whole
 from ...core.set_keys import with_set_keys
-from ...core.units import ARCSEC
+from ...core.units import ARCSEC, radians
 from ...design.metrics.field_zernikes import wavefront_zernikes
 from ...models.camera.photometry import READ_NOISE
 from ...models.parameters.parameters import Parameter, apply
@@ -30,6 +30,7 @@ from ...sensing.model import DonutModel
 from ...sensing.stamp_headers import PIXEL_KEY, TELESCOPE_KEY, WAVELENGTH_KEY
 from ...wavefront.corner_stars import corner_stars
 from ...wavefront.psf.stamps import Stamps
+from ...wavefront.pupil_optics import trace_pupils
 from ...wavefront.request import wavelength_points
 from .donuts import STAMP_SIZE, draw_donuts
 
@@ -37,6 +38,9 @@ from .donuts import STAMP_SIZE, draw_donuts
 _NOLL = np.arange(4, 23)
 #: Fraction of the radius of the field within which stars stand at random: donuts beyond lose light to rims.
 _WITHIN = 0.95
+#: Points of the pupil's rim whose light bounds a donut, and room beside it, in FWHM of the seeing.
+_RIM_POINTS = 16
+_WINGS = 1.5
 
 
 class DonutScene(Section):
@@ -54,8 +58,8 @@ class DonutScene(Section):
     electrons: Positive = Field(2e6, description="electrons of each star")
     sky: NotNegative = Field(300.0, description="expected electrons of the sky in a pixel, which are subtracted")
     read_noise: NotNegative = Field(READ_NOISE, description="rms noise without light [electrons]")
-    stamp: Annotated[int, Field(strict=True, ge=31, le=2001)] = Field(
-        STAMP_SIZE, description="side of a stamp [pixels]"
+    stamp: Annotated[int, Field(strict=True, ge=31, le=2001)] | None = Field(
+        None, description="side of a stamp [pixels]; by default 181, or what the donuts and their seeing need"
     )
     seed: Whole = Field(1, description="seed of places and noise")
 
@@ -151,7 +155,9 @@ def simulate_donuts(
         defocus = np.full(len(fields), shift)
         if scene.sides == 2:
             fields, defocus = np.tile(fields, (2, 1)), np.concatenate([defocus, -defocus])
-    images = np.empty((len(fields), scene.stamp, scene.stamp), dtype=np.float32)
+    furthest = model.detector.defocused(telescope, float(defocus[np.argmax(np.abs(defocus))]))
+    size = scene.stamp or _stamp_size(furthest, fields, model)
+    images = np.empty((len(fields), size, size), dtype=np.float32)
     for k, height in enumerate(np.unique(defocus)):
         rows = np.flatnonzero(defocus == height)
         images[rows] = draw_donuts(
@@ -162,7 +168,7 @@ def simulate_donuts(
             sky=scene.sky,
             read_noise=scene.read_noise,
             seed=int(stream(scene.seed, "donut file", k).integers(2**31)),
-            stamps=Stamps(scene.stamp),
+            stamps=Stamps(size),
         ).images
     waves = wavelength_points(telescope, None if model.light is None else model.light.wavelengths)
     before, after = (
@@ -170,6 +176,16 @@ def simulate_donuts(
         for t in (telescope, true)
     )
     return SimulatedDonuts(images, fields, defocus, (after - before)[:, _NOLL - 1], float(waves.mean()))
+
+
+def _stamp_size(telescope: Telescope, fields: np.ndarray, model: DonutModel) -> int:
+    """Return a side of stamps that holds donuts at fields, and the wings of their seeing [pixels]."""
+    angle = 2.0 * np.pi * np.arange(_RIM_POINTS) / _RIM_POINTS
+    rim = 0.5 * telescope.pupil_diameter * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    optics = trace_pupils(telescope, fields, telescope.default_wavelength, rim)
+    seeing = float(np.max(radians(model.air.fwhm, "fwhm"))) * float(np.abs(optics.jacobian).max())
+    reach = float(np.nanmax(np.abs(optics.displacement), initial=0.0)) + _WINGS * seeing
+    return max(STAMP_SIZE, 2 * int(np.ceil(reach / model.detector.pixel())) + 1)
 
 
 def write_donuts(path: Path, donuts: SimulatedDonuts, scene: DonutScene, model: DonutModel, telescope: str) -> None:
@@ -189,9 +205,9 @@ def write_donuts(path: Path, donuts: SimulatedDonuts, scene: DonutScene, model: 
     cards: Mapping[str, tuple[object, str]] = {
         "BUNIT": ("electron", "sky subtracted"),
         TELESCOPE_KEY: (telescope, "telescope that is believed in"),
-        WAVELENGTH_KEY: (1e9 * donuts.wavelength, "mean wavelength [nm]"),
+        WAVELENGTH_KEY: (round(1e9 * donuts.wavelength, 6), "mean wavelength [nm]"),
         "MOVED": (model.detector.moved, "what the defocus moved"),
-        PIXEL_KEY: (1e6 * model.detector.pixel(), "side of a pixel [um]"),
+        PIXEL_KEY: (round(1e6 * model.detector.pixel(), 9), "side of a pixel [um]"),
         "SKYVAR": (scene.sky + scene.read_noise**2, "variance of sky and readout [electron^2]"),
         "SEEING": (scene.seeing_arcsec, "FWHM of the long exposure [arcsec]"),
         "SEED": (scene.seed, "seed of all random numbers"),

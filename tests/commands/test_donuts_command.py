@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 import pachon
 from pachon.commands.cli import main
+from pachon.sensing.stamp_files import read_stamps
 
 # The pictures are drawn in tests/sensing/test_fit_donuts.py.
 pytestmark = pytest.mark.usefixtures("empty_pictures")
@@ -138,6 +139,19 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, part):
     assert captured.err.startswith("pachon: error: ")
     assert part in captured.err
     assert captured.err.count("\n") == 1
+
+
+@pytest.mark.long
+def test_a_simulated_file_says_of_what_it_is(tmp_path):
+    """Donuts of AuxTel, 1.92 mm across, fit on their stamps; its telescope is not taken for the LSST."""
+    path = tmp_path / "try.fits"
+    of_auxtel = ["-t", "auxtel", "--moved", "M2", "--defocus-um", "800", "--wavelength-nm", "700"]
+    assert main(["donuts", str(path), "--simulate", *of_auxtel, "--set", "stars=1", "--quiet"]) == 0
+    stamps = read_stamps(path)
+    assert stamps.header.model == "auxtel"
+    assert stamps.header.pixel == pytest.approx(10e-6)
+    assert stamps.header.wavelength == pytest.approx(700e-9)
+    assert 192 < fits.getdata(path).shape[1] < 260
 
 
 @pytest.mark.slow
