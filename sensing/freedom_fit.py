@@ -21,12 +21,12 @@ from ..wavefront.psf.pupil_rims import pupil_rims
 from .degrees import FreedomEstimate, FreedomRays, prior_spreads
 from .fit_star import StarFit
 from .inputs import noll_indices
+from .joint_errors import joint_errors
 from .light import Instrument
 from .moving_rims import FreeRims
 from .pupil_cells import PupilCells
 from .shared_rims import cells_across, group_with_rims, light_with, moved_rims_of_all, shared_rims
 from .solve import solve
-from .star_errors import by_residuals
 from .star_fitter import StarSolution
 from .vignetting import cells_with_rims, rim_shifts
 from .wavefront_fits import NOLL, FittedStars, UsableStars, WavefrontFit, joint_results
@@ -75,7 +75,9 @@ class TelescopeFreedoms(WavefrontFit):
         """Return a star whose light depends on degrees of freedom in place of its own Zernikes."""
         if star.best is None:
             return star
-        return replace(star, best=self._with_cells(instrument, star.best, star.best.stamp.rays.cells))
+        best = super().prepared(instrument, star).best
+        assert best is not None
+        return replace(star, best=self._with_cells(instrument, best, best.stamp.rays.cells))
 
     def solved(self, usable: UsableStars, pool: Executor) -> FittedStars:
         """Return the results of a joint fit with Gaussian priors."""
@@ -104,7 +106,7 @@ class TelescopeFreedoms(WavefrontFit):
             if float(change @ np.linalg.solve(joint.shared_covariance, change)) < _SETTLED * len(change):
                 break
             rims = rims.moved(change[first:])
-        lacking = by_residuals(instrument, stars, group, joint)
+        errors = joint_errors(instrument, usable.stars, response.matrix[:, noll - 1], stars, group, joint)
         after = freedoms.apply(telescope, shared[:count])
         believed, estimated = (
             wavefront_zernikes(t, fields, wavelength, jmax=last, projection=projection).coefficients[:, noll - 1]
@@ -114,10 +116,10 @@ class TelescopeFreedoms(WavefrontFit):
         response = sensitivity(after, freedoms, fields, wavelength, n_zernike=many, projection=projection)
         # Rims and slopes of the response are no part of the wavefront.
         zernike_maps = np.pad(response.matrix[:, noll - 1], ((0, 0), (0, 0), (0, len(slopes) + len(rims))))
-        covariance = (joint.shared_covariance + lacking.shared_covariance)[:count, :count]
+        covariance = (joint.shared_covariance + errors.shared)[:count, :count]
         moved = moved_rims_of_all(instrument, stars, rims, joint, first)
         return FittedStars(
-            joint_results(stars, joint, lacking, estimated - believed, list(zernike_maps), moved, slice(count, first)),
+            joint_results(stars, joint, errors, estimated - believed, list(zernike_maps), moved, slice(count, first)),
             degrees_of_freedom=FreedomEstimate(freedoms, shared[:count], covariance, spreads),
         )
 

@@ -456,3 +456,11 @@ def line_cells(cells: PupilCells, lines: RimLines, free: np.ndarray) -> PupilCel
     moments = lines.along[:, :, None] * lines.along[:, None, :] / 12.0
     rates = lines.rates(free) / (cells.side**2 * cells.area)
     return replace(cells, points=lines.points, weights=np.zeros(len(lines.points)), moments=moments, rates=rates)
+
+
+def steps_of_bounding(rates: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return steps of free motions [n] of one star's rims, zero for rims that bound no light where they stand.
+
+    Without an effect on light, by its rates [n_point, n], a fit has such rims where they are believed to be.
+    """
+    return np.where(rates.any(axis=0), steps, 0.0)

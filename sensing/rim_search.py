@@ -14,7 +14,7 @@ from .donut_rays import ZernikeRays
 from .image_model import STRENGTH, LandedLight
 from .light import Instrument, StarLight
 from .likelihood import Stamp, light_columns, linearized
-from .moving_rims import PupilShadows, RimBody, line_cells
+from .moving_rims import PupilShadows, RimBody, line_cells, steps_of_bounding
 from .solve import Solution
 
 #: Least gain of twice the logarithm of the likelihood by a rim elsewhere: noise makes one in 1e5 of three motions.
@@ -270,5 +270,6 @@ def settled(
 
 def _relative_step(instrument: Instrument, fit: RimFit) -> np.ndarray:
     """Return how far the rims of a fit are from their shadows, over their standard deviations."""
-    first = len(instrument.noll) + fit.light.before_free_rims
-    return np.asarray(fit.solution.waves[0][first:] / fit.light.free_rims.spreads)
+    before = fit.light.before_free_rims
+    steps = fit.solution.waves[0][len(instrument.noll) + before :]
+    return steps_of_bounding(fit.stamp.rays.rates[:, before:], steps) / fit.light.free_rims.spreads

@@ -11,7 +11,7 @@ from astropy.table import QTable
 
 from .light import Instrument, StarLight
 from .likelihood import Stamp
-from .moving_rims import PupilShadows, RimBody, RimLines
+from .moving_rims import PupilShadows, RimBody, RimLines, steps_of_bounding
 from .rim_outlines import MOTIONS, RimMotion
 from .star_fitter import StarSolution
 
@@ -58,7 +58,8 @@ def moved_rims(instrument: Instrument, star: StarSolution) -> list[MovedRim]:
     light = star.light
     first = len(instrument.noll) + light.before_free_rims
     free = slice(first, first + len(light.free_rims))
-    steps, covariance = star.solution.shared[free], star.solution.shared_covariance[free, free]
+    steps = steps_of_bounding(star.stamp.rays.rates[:, light.before_free_rims :], star.solution.shared[free])
+    covariance = star.solution.shared_covariance[free, free]
     return rims_at(instrument, light, star.stamp, steps, covariance)
 
 
@@ -67,7 +68,7 @@ def rims_at(
 ) -> list[MovedRim]:
     """Return the free rims of the light of a star after steps of their free motions, with their covariance.
 
-    Those that do not bound the light are left out.
+    Those that do not bound the light, neither where they stand nor where they are believed to, are left out.
     """
     rims = light.free_rims
     if not rims.bodies:
@@ -78,10 +79,14 @@ def rims_at(
     places = np.flatnonzero(free.ravel())
     covariance[np.ix_(places, places)] = step_covariance
     cells = stamp.rays.cells
-    lines = PupilShadows(light.telescope, light.direction, instrument.middle, cells).lines(rims.bodies)
+    standing, believed = (
+        PupilShadows(telescope, light.direction, instrument.middle, cells).lines(rims.bodies)
+        for telescope in (light.telescope, light.prescribed or light.telescope)
+    )
     pixels = np.sqrt(abs(float(np.linalg.det(stamp.grid.footprint)))) / cells.side / instrument.pixel
     moved = []
     for k, body in enumerate(rims.bodies):
+        lines = standing if (standing.body == k).any() else believed
         if not (lines.body == k).any():
             continue
         block = slice(MOTIONS * k, MOTIONS * (k + 1))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -17,7 +16,6 @@ from .image_model import STRENGTH
 from .light import Instrument
 from .likelihood import Linearized, linearized, wavefront_columns
 from .residual_power import residual_power
-from .solve import Group, Solution
 from .star_fitter import StarSolution
 
 #: Terms up to the eleventh radial degree: what the mean wavefront of the air has beyond is lost in the seeing.
@@ -118,7 +116,7 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
         power = residual_power(
             point,
             photons,
-            _resolution(instrument, star),
+            resolution(instrument, star),
             beside.patterns,
             beside.unfitted,
             precision * (np.concatenate([solution.stars[0], solution.shared]) - means),
@@ -185,44 +183,7 @@ def _air_of(instrument: Instrument, last: int) -> np.ndarray:
     return air_shape(last, round(telescope.pupil_obscuration, 4), outer_scale)
 
 
-def by_residuals(instrument: Instrument, stars: Sequence[StarSolution], group: Group, solution: Solution) -> Solution:
-    """Return a joint solution whose covariance is that by what the model lacks, as the residuals of its stars say.
-
-    Parameters
-    ----------
-    instrument : Instrument
-        Telescope and model of the images.
-    stars : sequence of StarSolution
-        The stars, each by itself.
-    group : Group
-        The same as they were fitted together.
-    solution : Solution
-        Their joint solution.
-    """
-    covariance = np.zeros_like(solution.covariance)
-    first, n_shared = 0, len(solution.shared)
-    shared = np.arange(len(covariance) - n_shared, len(covariance))
-    for i, stamp in enumerate(group.stamps):
-        n_star = len(solution.stars[i])
-        unknowns = np.concatenate([first + np.arange(n_star), shared])
-        first += n_star
-        point = linearized(stamp, solution.stars[i], solution.waves[i])
-        if point is not None:
-            columns = point.columns * point.scales.astype(np.float32)
-            joined = np.concatenate(
-                [columns[:, :n_star], columns[:, n_star:] @ group.maps[i].astype(np.float32)], axis=1
-            )
-            point = replace(point, columns=joined, scales=np.ones(n_star + n_shared))
-            block = np.ix_(unknowns, unknowns)
-            covariance[block] += residual_power(
-                point, solution.covariance[block], _resolution(instrument, stars[i])
-            ).covariance
-        if group.transient:
-            stamp.release()
-    return replace(solution, covariance=covariance)
-
-
-def _resolution(instrument: Instrument, star: StarSolution) -> float:
+def resolution(instrument: Instrument, star: StarSolution) -> float:
     """Return the width of the finest detail of an image [pixels of the fit]."""
     seeing = float(instrument.seeing.fwhm(star.solution.stars[0][STRENGTH])) * star.light.scale
     return max(math.hypot(seeing, _FWHM_PER_RMS * instrument.diffusion) / star.stamp.grid.pixel, 1.0)

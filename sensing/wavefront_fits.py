@@ -24,12 +24,13 @@ from .degrees import FreedomEstimate
 from .exposure import ExposureWavefront
 from .fit_star import StarFit
 from .inputs import noll_indices, small_length
+from .joint_errors import JointErrors, joint_errors
 from .light import Instrument
 from .likelihood import Stamp, model_image
 from .rim_table import MovedRim
 from .shared_rims import group_with_rims, moved_rims_of_all, settled, shared_rims, with_shared_rims
 from .solve import Solution, solve
-from .star_errors import ErrorParts, air_of_terms, by_residuals, model_floor, star_errors, with_errors
+from .star_errors import ErrorParts, air_of_terms, model_floor, star_errors, with_errors
 from .star_fitter import StarSolution
 from .terms import WavefrontTerms
 
@@ -144,8 +145,8 @@ class WavefrontFit(ABC):
         return WavefrontTerms.of(noll_indices(self.noll, "noll", 4))
 
     def prepared(self, instrument: Instrument, star: StarFit) -> StarFit:
-        """Return a star that was fitted by itself, made ready for :meth:`solved`: with its errors if it stays alone."""
-        if self.joint or star.usable is None:
+        """Return a star that was fitted by itself, made ready for :meth:`solved`: with errors of its wavefront."""
+        if star.usable is None or not len(star.usable.solution.shared):
             return star
         return replace(star, best=with_errors(instrument, star.usable))
 
@@ -282,13 +283,13 @@ class FieldTerms(WavefrontFit):
             rims = rims.moved(solution.shared[first:])
         n = len(instrument.terms.requested)
         requested = (n_noll * np.arange(n_field)[:, None] + np.arange(n)).ravel()
-        lacking = by_residuals(instrument, stars, group, solution)
-        shared_covariance = solution.shared_covariance + lacking.shared_covariance
+        errors = joint_errors(instrument, usable.stars, wave_maps, stars, group, solution)
+        shared_covariance = solution.shared_covariance + errors.shared
         return FittedStars(
             joint_results(
                 stars,
                 solution,
-                lacking,
+                errors,
                 np.array(solution.waves)[:, :n],
                 [of_star[:n] for of_star in group.maps],
                 moved_rims_of_all(instrument, stars, rims, solution, first),
@@ -302,7 +303,7 @@ class FieldTerms(WavefrontFit):
 def joint_results(
     stars: Sequence[StarSolution],
     solution: Solution,
-    lacking: Solution,
+    errors: JointErrors,
     zernikes: np.ndarray,
     zernike_maps: np.ndarray | Sequence[np.ndarray],
     rims: Sequence[list[MovedRim]],
@@ -316,8 +317,8 @@ def joint_results(
         The stars with their last stamps.
     solution : Solution
         Unknowns of all stars and the shared ones.
-    lacking : Solution
-        The same with the covariance by what the model lacks.
+    errors : JointErrors
+        What they are uncertain by beyond the noise.
     zernikes : ndarray, shape [n_star, n_noll]
         Wavefront of each star [m].
     zernike_maps : sequence of n_star ndarray, each of shape [n_noll, n_shared]
@@ -328,19 +329,23 @@ def joint_results(
         Which of the shared unknowns are slopes of the response.
     """
     results = []
-    spread_of_slopes = np.sqrt(np.diag(solution.shared_covariance + lacking.shared_covariance)[slopes])
+    spread_of_slopes = np.sqrt(np.diag(solution.shared_covariance + errors.shared)[slopes])
     response_slope = np.array([solution.shared[slopes], spread_of_slopes])
     for i, star in enumerate(stars):
         pixels = replace(star.full, rays=star.stamp.rays)
         model = model_image(pixels, solution.stars[i], solution.waves[i])
         pixels.release()
-        spread, lack = (
+        photons, lacking, air, figure = (
             zernike_maps[i] @ shared @ zernike_maps[i].T
-            for shared in (solution.shared_covariance, lacking.shared_covariance)
+            for shared in (
+                solution.shared_covariance,
+                errors.residuals.shared_covariance,
+                errors.air,
+                errors.figure,
+            )
         )
-        covariance = solution.star_covariance(i) + lacking.star_covariance(i)
-        floor = model_floor(zernikes[i])
-        parts = ErrorParts.of(spread, lack, np.zeros_like(spread), floor)
+        covariance = solution.star_covariance(i) + errors.residuals.star_covariance(i)
+        parts = ErrorParts.of(photons, lacking, air, figure + model_floor(zernikes[i]))
         moved = rims[i] if rims else ()
         unknowns = solution.stars[i]
         results.append(FittedStar(pixels, model, unknowns, covariance, zernikes[i], parts, moved, response_slope))
