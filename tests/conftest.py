@@ -6,6 +6,13 @@ import sys
 from contextlib import contextmanager
 from types import SimpleNamespace
 
+if "PYTEST_XDIST_WORKER" in os.environ and hasattr(os, "sched_setaffinity"):
+    # Each worker has its share of the processors: threads of both on the same ones would wait for each other. Libraries
+    # count the processors when they are imported.
+    processors = sorted(os.sched_getaffinity(0))
+    worker, workers = int(os.environ["PYTEST_XDIST_WORKER"][2:]), int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    os.sched_setaffinity(0, processors[worker::workers] or processors)
+
 import numpy as np
 import pytest
 import yaml

@@ -27,7 +27,7 @@ from functools import partial
 
 import warp as wp
 
-from ...core.launch import FORWARD_OPTIONS
+from ...core.launch import ROLLED_OPTIONS
 from ..kernels.kernel_pair import kernel_pair
 from ..kernels.packet import LANES, RayPackets, components, lanes, lanes_sqrt
 from ..kernels.shape_derivatives import added_derivatives
@@ -62,7 +62,7 @@ from .column_kernels import (
     write_gap,
 )
 
-wp.set_module_options(FORWARD_OPTIONS)
+wp.set_module_options(ROLLED_OPTIONS)
 
 
 def backward_loop(special: bool) -> wp.Function:
@@ -300,7 +300,7 @@ def backward_loop(special: bool) -> wp.Function:
 BACKWARD_LOOPS = (backward_loop(False), backward_loop(True))
 
 
-@partial(kernel_pair, shared=__package__)
+@partial(kernel_pair, shared=__package__, options=ROLLED_OPTIONS)
 def backward_rays(special: bool, module: wp.Module) -> wp.Kernel:
     """Return the kernel of the backward pass."""
     backward_through = BACKWARD_LOOPS[special]

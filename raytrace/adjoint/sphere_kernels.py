@@ -6,7 +6,7 @@ from functools import partial
 
 import warp as wp
 
-from ...core.launch import FORWARD_OPTIONS
+from ...core.launch import ROLLED_OPTIONS
 from ..kernels.kernel_pair import kernel_pair
 from ..kernels.packet import LANES, RayPackets, lane_flags, lanes
 from ..kernels.pupil import direction_from_point, plane_wave_start
@@ -17,13 +17,13 @@ from ..kernels.trace import LOOPS, statuses
 from .backward_kernels import BACKWARD_LOOPS
 from .column_kernels import INDEX, polynomial_columns
 
-wp.set_module_options(FORWARD_OPTIONS)
+wp.set_module_options(ROLLED_OPTIONS)
 
 #: Columns of the sphere: the path beyond that of the chief ray [m], and its derivatives by the landing point (3).
 SPHERE_COLUMNS = 4
 
 
-@partial(kernel_pair, shared=__package__)
+@partial(kernel_pair, shared=__package__, options=ROLLED_OPTIONS)
 def sphere_paths(special: bool, module: wp.Module) -> wp.Kernel:
     """Return the kernel of both passes."""
     through_telescope = LOOPS[special]

@@ -31,7 +31,7 @@ AHEAD = wp.constant(wp.float64(1.0e-9))
 def reaches_twice(w: lanes, limit: wp.float64):
     """Whether the direction cosine of a lane is within a limit."""
     count = wp.int32(0)
-    for i in range(LANES):
+    for i in range(int(LANES)):
         count += wp.where(wp.abs(w[i]) <= limit, 1, 0)
     return count > 0
 
@@ -79,7 +79,7 @@ def landing(
     if surfaces.kinds[s, STOPPED] == 2:
         status = through_aperture(surfaces.apertures, s, px, py, status)
     rank = lanes(ZERO)
-    for i in range(LANES):
+    for i in range(int(LANES)):
         within = wp.where(a2[i] < outer * outer, ONE, ZERO)
         rank[i] = within + wp.where(a2[i] >= inner * inner, within, ZERO)
         if surfaces.kinds[s, STOPPED] == 2:
@@ -118,7 +118,7 @@ def start_by_aperture(
         centred = False
     least = wp.where(centred, ZERO, ONE)
     t = lanes()
-    for i in range(LANES):
+    for i in range(int(LANES)):
         better = wp.where(second_rank[i] > rank[i], ONE, ZERO)
         ahead = wp.where(distance[i] > AHEAD, ONE, ZERO)
         second_ahead = wp.where(second_distance[i] > AHEAD, ONE, ZERO)

@@ -29,8 +29,13 @@ class KernelPair:
         return self.special if surfaces.special else self.plain
 
 
-def kernel_pair(make: Callable[[bool, wp.Module], wp.Kernel], *, shared: str | None = None) -> KernelPair:
-    """Return the variants of the kernel that ``make(special, module)`` defines in a module.
+def kernel_pair(
+    make: Callable[[bool, wp.Module], wp.Kernel],
+    *,
+    shared: str | None = None,
+    options: dict[str, Any] = FORWARD_OPTIONS,
+) -> KernelPair:
+    """Return the variants of the kernel that ``make(special, module)`` defines in a module with these `options`.
 
     ``special`` is False for plain telescopes, True for any. Special variants of the same name `shared` are in one
     module, and must all be defined before it is loaded.
@@ -39,7 +44,7 @@ def kernel_pair(make: Callable[[bool, wp.Module], wp.Kernel], *, shared: str | N
     def variant(special: bool) -> wp.Kernel:
         name = f"{shared or make.__module__}_special" if special else f"{make.__module__}_plain"
         module = wp.get_module(name)
-        wp.set_module_options(FORWARD_OPTIONS, module=module)
+        wp.set_module_options(options, module=module)
         return make(special, module)
 
     return KernelPair(variant(False), variant(True))

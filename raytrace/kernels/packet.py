@@ -3,6 +3,9 @@
 A kernel on packets traces the LSST about ten times as fast as the same kernel on single rays, because the compiler
 keeps each quantity in full-width registers. A branch becomes a choice per lane (``wp.where``), so a lane's result
 never depends on its neighbours: cutting a batch differently changes no byte.
+
+Loops over ``range(LANES)`` are unrolled whole, which is fast and compiles slowly. Where few telescopes come along they
+are ``range(int(LANES))``, which Warp leaves a loop.
 """
 
 from __future__ import annotations

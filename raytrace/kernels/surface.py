@@ -95,7 +95,7 @@ def second_conic_distance(
     r = lanes_sqrt(wp.cw_mul(b, b) - wp.cw_mul(a, e))
     top = lanes()
     bottom = lanes()
-    for i in range(LANES):
+    for i in range(int(LANES)):
         # The root of the other sign, in the form that does not cancel.
         signed = wp.where(w[i] < sign_change, r[i], -r[i])
         same = wp.where(w[i] < sign_change, b[i], -b[i]) >= ZERO

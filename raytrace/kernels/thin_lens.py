@@ -30,7 +30,7 @@ def slope_length(p: lanes, q: lanes):
 def lens_slopes(power: wp.float64, n: lanes, behind: lanes, x: lanes, y: lanes, u: lanes, v: lanes, w: lanes):
     """Slopes in front of the lens and behind it."""
     depth = lanes()
-    for i in range(LANES):
+    for i in range(int(LANES)):
         depth[i] = wp.abs(w[i])
     p = wp.cw_div(u, depth)
     q = wp.cw_div(v, depth)
@@ -61,7 +61,7 @@ def through_thin_lens(
     back = slope_length(wp.cw_mul(k1, x) + p1, wp.cw_mul(k1, y) + q1) + length
     added = wp.cw_mul(n, wp.cw_div(before, front)) + wp.cw_mul(behind, wp.cw_div(after, back))
     side = lanes()
-    for i in range(LANES):
+    for i in range(int(LANES)):
         side[i] = wp.where(w[i] < ZERO, -ONE, ONE)
     return wp.cw_div(p1, length), wp.cw_div(q1, length), wp.cw_div(side, length), added
 
@@ -88,7 +88,7 @@ def thin_lens_adjoint(
     k1 = (power - n * vergence) / behind
     square = wp.cw_mul(x, x) + wp.cw_mul(y, y)
     side = lanes()
-    for i in range(LANES):
+    for i in range(int(LANES)):
         side[i] = wp.where(w[i] < ZERO, -ONE, ONE)
     length = slope_length(p1, q1)
     # By the slopes behind: those of the unit direction, and of the path.

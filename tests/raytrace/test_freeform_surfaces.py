@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 import pachon
-from pachon.core.launch import FORWARD_OPTIONS, launch, start_warp
+from pachon.core.launch import ROLLED_OPTIONS, launch, start_warp
 from pachon.models.media.medium import ConstantIndex
 from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid
 from pachon.models.shapes.grid import GridSag
@@ -26,8 +26,8 @@ from pachon.raytrace.kernels.shape_derivatives import added_derivatives
 from pachon.raytrace.pack.shapes import pack_deformations, split_shape
 from pachon.raytrace.rays import Rays, RayStatus
 
-# The kernel of this file runs once: to optimise it would take longer than all else.
-wp.set_module_options(FORWARD_OPTIONS | {"optimization_level": 0})
+# The kernel of this file runs once: to unroll and optimise it would take longer than all else.
+wp.set_module_options(ROLLED_OPTIONS | {"optimization_level": 0})
 
 RNG = np.random.default_rng(5)
 NODES_X, NODES_Y = np.linspace(-1.0, 1.0, 21), np.linspace(-1.1, 1.1, 15)

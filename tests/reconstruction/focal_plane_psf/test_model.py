@@ -1,6 +1,5 @@
 """The model against synthetic exposures: holdout positions, heights, uncertainties, files, bad input."""
 
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -190,8 +189,6 @@ def test_no_byte_depends_on_the_threads(aligned, exposure, few, lsst_r, waveleng
 @pytest.fixture(scope="module")
 def of_two_threads_of_blas(exposure, few, lsst_r, wavelengths):
     """As `aligned`, which has one of them."""
-    if len(os.sched_getaffinity(0)) < 2:
-        pytest.skip("BLAS has one thread on one processor")
     with threadpool_limits(2, user_api="blas"):
         return FocalPlanePsf.fit(
             exposure.stars(few), Instrument.of(lsst_r, wavelengths), camera=exposure.camera, prior=ALIGNED, threads=1
