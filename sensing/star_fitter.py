@@ -172,7 +172,9 @@ class StarFitter:
         return bool(self.donut and self._wavefront and self.instrument.model.rims.search and all_terms)
 
     def with_light(self, light: StarLight) -> StarFitter:
-        """Return the same for the light of the star with its rims elsewhere."""
+        """Return the same for the light of the star with its rims elsewhere; light that is the same was traced."""
+        if light is self._light:
+            return self
         fitter = copy(self)
         fitter._set_light(light)
         return fitter
