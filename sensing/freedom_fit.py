@@ -25,7 +25,15 @@ from .joint_errors import joint_errors
 from .light import Instrument
 from .moving_rims import FreeRims
 from .pupil_cells import PupilCells
-from .shared_rims import cells_across, group_with_rims, light_with, moved_rims_of_all, shared_rims
+from .shared_rims import (
+    JointFit,
+    cells_across,
+    group_with_rims,
+    least_rims,
+    light_with,
+    moved_rims_of_all,
+    shared_rims,
+)
 from .solve import solve
 from .star_fitter import StarSolution
 from .vignetting import cells_with_rims, rim_shifts
@@ -87,27 +95,35 @@ class TelescopeFreedoms(WavefrontFit):
         fields, projection = usable.fields, usable.projection
         last = int(noll.max())
         response = sensitivity(telescope, freedoms, fields, wavelength, n_zernike=last, projection=projection)
-        count, rims, slopes = len(freedoms), shared_rims(instrument, usable.stars), instrument.slope_spreads
+        count, slopes = len(freedoms), instrument.slope_spreads
         first = count + len(slopes)
         shifts = self._rim_shifts(usable, spreads)
         maps = [block_diag(np.concatenate([np.eye(count), of_star]), np.eye(len(slopes))) for of_star in shifts]
         precision = np.concatenate([spreads, slopes]) ** -2.0
         shared, unknowns = usable.start(response.matrix[:, noll - 1], spreads**-2.0), usable.unknowns
         shared = np.append(shared, 0.0 * slopes)
-        for _ in range(_OUTER):
-            stars = [
-                self._with_vignetting(instrument, star, rims, shared[:count], star_shifts @ shared[:count])
-                for star, star_shifts in zip(usable.stars, shifts, strict=True)
-            ]
-            group = group_with_rims(instrument, stars, maps, precision, rims, transient=True)
-            start = np.concatenate([shared, np.zeros(len(rims))])
-            joint = solve(group, unknowns, start, steps=_INNER, pool=pool)
-            change, shared, unknowns = joint.shared - start, joint.shared[:first], list(joint.stars)
-            if float(change @ np.linalg.solve(joint.shared_covariance, change)) < _SETTLED * len(change):
-                break
-            rims = rims.moved(change[first:])
+
+        def fitted(rims: FreeRims) -> JointFit:
+            at, of_stars = shared, unknowns
+            for _ in range(_OUTER):
+                stars = [
+                    self._with_vignetting(instrument, star, rims, at[:count], star_shifts @ at[:count])
+                    for star, star_shifts in zip(usable.stars, shifts, strict=True)
+                ]
+                group = group_with_rims(instrument, stars, maps, precision, rims, transient=True)
+                start = np.concatenate([at, np.zeros(len(rims))])
+                solution = solve(group, of_stars, start, steps=_INNER, pool=pool)
+                joint = JointFit(stars, group, solution, rims)
+                change, at, of_stars = solution.shared - start, solution.shared[:first], list(solution.stars)
+                if float(change @ np.linalg.solve(solution.shared_covariance, change)) < _SETTLED * len(change):
+                    break
+                rims = rims.moved(change[first:])
+            return joint
+
+        stars, group, joint, rims = least_rims(shared_rims(instrument, usable.stars), fitted)
         errors = joint_errors(instrument, usable.stars, response.matrix[:, noll - 1], stars, group, joint)
-        after = freedoms.apply(telescope, shared[:count])
+        values = joint.shared[:count]
+        after = freedoms.apply(telescope, values)
         believed, estimated = (
             wavefront_zernikes(t, fields, wavelength, jmax=last, projection=projection).coefficients[:, noll - 1]
             for t in (telescope, after)
@@ -120,7 +136,7 @@ class TelescopeFreedoms(WavefrontFit):
         moved = moved_rims_of_all(instrument, stars, rims, joint, first)
         return FittedStars(
             joint_results(stars, joint, errors, estimated - believed, list(zernike_maps), moved, slice(count, first)),
-            degrees_of_freedom=FreedomEstimate(freedoms, shared[:count], covariance, spreads),
+            degrees_of_freedom=FreedomEstimate(freedoms, values, covariance, spreads),
         )
 
     def _rim_shifts(self, usable: UsableStars, spreads: np.ndarray) -> list[np.ndarray]:
@@ -151,7 +167,7 @@ class TelescopeFreedoms(WavefrontFit):
         changed = self.freedoms.apply(light.telescope, at)
         across = cells_across(instrument, star)
         cells = cells_with_rims(changed, light.direction, instrument.middle, across, light.rims, rims)
-        if (light.rims or rims.bodies) and light.pupil_rims is not None:
+        if (light.rims or light is not star.light) and light.pupil_rims is not None:
             outlines = pupil_rims(changed, light.direction, instrument.middle)
             stamp, full = (replace(s, grid=s.grid.with_rims(outlines)) for s in (star.stamp, star.full))
             star = replace(star, stamp=stamp, full=full)

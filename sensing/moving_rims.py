@@ -137,6 +137,11 @@ class FreeRims:
         bodies = tuple(itertools.compress(self.bodies, ~same))
         return FreeRims((*bodies, body), np.concatenate([self.values[~same], value]))
 
+    def unmoved(self) -> FreeRims:
+        """Return those of bodies that stand where they are prescribed, and may have another size."""
+        held = np.array([not body.moved for body in self.bodies], dtype=bool)
+        return FreeRims(tuple(itertools.compress(self.bodies, held)), self.values[held])
+
     def moved(self, steps: np.ndarray) -> FreeRims:
         """Return the rims moved by steps of the free motions [n], within a few standard deviations."""
         values, limit = self.values.copy(), _MOST * self.spreads

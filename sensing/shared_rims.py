@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -17,9 +18,9 @@ from .solve import Group, Solution
 from .stamps import Pixels
 from .star_fitter import StarSolution
 
-#: Rise of the loss of donuts that do not have a rim elsewhere by themselves, in units of that of a pixel, from which on
-#: they contradict it.
-_CONTRADICTED = 25.0
+#: Change of the loss by rims elsewhere, in units of that of a pixel, that is more than chance: a gain by which they are
+#: free in a joint fit, or a rise by which donuts that do not have them elsewhere by themselves contradict them.
+_DECIDES = 25.0
 #: Step of the rims over their standard deviations that is small enough to be linear.
 _SETTLED = 0.05
 
@@ -48,6 +49,28 @@ def shared_rims(instrument: Instrument, stars: Sequence[StarSolution]) -> FreeRi
     return rims.moved(np.linalg.lstsq(curvature, gradient, rcond=1e-12)[0]) if len(rims) else rims
 
 
+class JointFit(NamedTuple):
+    """Stars with the light of some rims, as they are fitted together, and their solution."""
+
+    stars: list[StarSolution]
+    group: Group
+    solution: Solution
+    rims: FreeRims
+
+
+def least_rims(rims: FreeRims, fitted: Callable[[FreeRims], JointFit]) -> JointFit:
+    """Return a joint fit with rims that stars have elsewhere, unless one with these as prescribed is as good.
+
+    What all stars share, such as a camera aside, moves shadows that each star by itself takes for those of rims.
+    """
+    if not any(body.moved for body in rims.bodies):
+        return fitted(rims)
+    prescribed, elsewhere = fitted(rims.unmoved()), fitted(rims)
+    pixels = sum(int(star.stamp.used.sum()) for star in elsewhere.stars)
+    gain = prescribed.solution.loss - elsewhere.solution.loss
+    return elsewhere if gain > _DECIDES * max(1.0, elsewhere.solution.loss / pixels) else prescribed
+
+
 def contradicted(alone: Mapping[int, StarSolution], together: Mapping[int, StarSolution]) -> bool:
     """Return whether stars without rims of their own elsewhere fit worse with those that others have.
 
@@ -62,7 +85,7 @@ def contradicted(alone: Mapping[int, StarSolution], together: Mapping[int, StarS
         if not any(body.moved for body in before.light.free_rims.bodies):
             losses = [star.solution.loss / star.stamp.used.sum() for star in (before, after)]
             rise += (losses[1] / losses[0] - 1.0) * after.stamp.used.sum()
-    return rise > _CONTRADICTED
+    return rise > _DECIDES
 
 
 def _places(rims: FreeRims, star_rims: FreeRims) -> np.ndarray:
@@ -100,7 +123,7 @@ def with_shared_rims(instrument: Instrument, star: StarSolution, rims: FreeRims)
     rays, first = star.stamp.rays, len(instrument.noll)
     assert isinstance(rays, ZernikeRays)
     held = star.solution.waves[0][first : first + 2 * len(star.light.rims)].copy()
-    if not rims.bodies:
+    if not (rims.bodies or star.light.free_rims.bodies):
         return replace(star, stamp=replace(star.stamp, rays=rays.holding(held)))
     light = light_with(instrument, star, rims)
     names = rims.surfaces(light.telescope)

@@ -27,8 +27,17 @@ from .inputs import noll_indices, small_length
 from .joint_errors import JointErrors, joint_errors
 from .light import Instrument
 from .likelihood import Stamp, model_image
+from .moving_rims import FreeRims
 from .rim_table import MovedRim
-from .shared_rims import group_with_rims, moved_rims_of_all, settled, shared_rims, with_shared_rims
+from .shared_rims import (
+    JointFit,
+    group_with_rims,
+    least_rims,
+    moved_rims_of_all,
+    settled,
+    shared_rims,
+    with_shared_rims,
+)
 from .solve import Solution, solve
 from .star_errors import ErrorParts, air_of_terms, model_floor, star_errors, with_errors
 from .star_fitter import StarSolution
@@ -272,15 +281,21 @@ class FieldTerms(WavefrontFit):
         shared, unknowns = np.append(usable.start(wave_maps, precision), 0.0 * slopes), usable.unknowns
         maps = [block_diag(of_star, np.eye(len(slopes))) for of_star in wave_maps]
         precision, first = np.append(precision, slopes**-2.0), len(shared)
-        rims = shared_rims(instrument, usable.stars)
-        for _ in range(RIM_STEPS):
-            stars = [with_shared_rims(instrument, star, rims) for star in usable.stars]
-            group = group_with_rims(instrument, stars, maps, precision, rims)
-            solution = solve(group, unknowns, np.concatenate([shared, np.zeros(len(rims))]), pool=pool)
-            shared, unknowns = solution.shared[:first], list(solution.stars)
-            if settled(rims, solution.shared[first:]):
-                break
-            rims = rims.moved(solution.shared[first:])
+
+        def fitted(rims: FreeRims) -> JointFit:
+            at, of_stars = shared, unknowns
+            for _ in range(RIM_STEPS):
+                stars = [with_shared_rims(instrument, star, rims) for star in usable.stars]
+                group = group_with_rims(instrument, stars, maps, precision, rims)
+                solution = solve(group, of_stars, np.concatenate([at, np.zeros(len(rims))]), pool=pool)
+                joint = JointFit(stars, group, solution, rims)
+                at, of_stars = solution.shared[:first], list(solution.stars)
+                if settled(rims, solution.shared[first:]):
+                    break
+                rims = rims.moved(solution.shared[first:])
+            return joint
+
+        stars, group, solution, rims = least_rims(shared_rims(instrument, usable.stars), fitted)
         n = len(instrument.terms.requested)
         requested = (n_noll * np.arange(n_field)[:, None] + np.arange(n)).ravel()
         errors = joint_errors(instrument, usable.stars, wave_maps, stars, group, solution)
