@@ -233,6 +233,10 @@ def measured(image, catalogue, tmp_path_factory):
 def test_a_damaged_product_is_made_again_to_the_same_bytes(measured, monkeypatch, catalogue, product, damage):
     folder, whole = measured
     damaged = DAMAGES[damage](whole[f"a_{product}.fits"], whole[f"b_{product}.fits"])
+    if damaged == whole[f"a_{product}.fits"]:
+        # Both images have the PSF model of one catalogue here: the catalogue of the other is what can be told.
+        assert (product, damage) == ("psf", "that of another image")
+        return
     path = folder / f"a_{product}.fits"
     path.unlink() if damaged is None else path.write_bytes(damaged)
     measured_images = []
