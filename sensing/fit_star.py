@@ -270,11 +270,11 @@ def _with_another_rim(search: _Search, first: Solution | None) -> _Search:
 def _with_explained_pixels(begun: StarFitter, search: _Search) -> _Search:
     """Return a search with those pixels that were left out before its rims were free, and are not far off its model."""
     fitter, best = search.fitter, search.best
-    explained = begun.with_light(fitter.light).without_outliers(best.stars[0], best.waves[0])
-    used = fitter.clean.used | explained
+    every_pixel = begun.with_light(fitter.light)
+    used = fitter.clean.used | every_pixel.without_outliers(best.stars[0], best.waves[0])
     if (used == fitter.clean.used).all():
         return search
-    fitter = begun.with_light(fitter.light).with_used(used)
+    fitter = every_pixel.with_used(used)
     start = fitter.start()
     best = fitter.solve(start.stamp, best.stars[0], best.shared, COARSE)
     fit = RimFit(fitter.light, start.stamp, best, search.rivals)

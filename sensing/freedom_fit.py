@@ -120,7 +120,8 @@ class TelescopeFreedoms(WavefrontFit):
                 rims = rims.moved(change[first:])
             return joint
 
-        stars, group, joint, rims = least_rims(shared_rims(instrument, usable.stars), fitted)
+        fit = least_rims(shared_rims(instrument, usable.stars), fitted)
+        stars, group, joint, rims = fit
         errors = joint_errors(instrument, usable.stars, response.matrix[:, noll - 1], stars, group, joint)
         values = joint.shared[:count]
         after = freedoms.apply(telescope, values)
@@ -133,7 +134,7 @@ class TelescopeFreedoms(WavefrontFit):
         # Rims and slopes of the response are no part of the wavefront.
         zernike_maps = np.pad(response.matrix[:, noll - 1], ((0, 0), (0, 0), (0, len(slopes) + len(rims))))
         covariance = (joint.shared_covariance + errors.shared)[:count, :count]
-        moved = moved_rims_of_all(instrument, stars, rims, joint, first)
+        moved = moved_rims_of_all(instrument, fit, first)
         return FittedStars(
             joint_results(stars, joint, errors, estimated - believed, list(zernike_maps), moved, slice(count, first)),
             degrees_of_freedom=FreedomEstimate(freedoms, values, covariance, spreads),

@@ -173,21 +173,12 @@ def group_with_rims(
     )
 
 
-def moved_rims_of_all(
-    instrument: Instrument, stars: Sequence[StarSolution], rims: FreeRims, solution: Solution, first: int
-) -> list[list[MovedRim]]:
-    """Return the rims of all stars as each star shows them.
+def moved_rims_of_all(instrument: Instrument, joint: JointFit, first: int) -> list[list[MovedRim]]:
+    """Return the rims of all stars as each star shows them; none without free ones.
 
-    Parameters
-    ----------
-    instrument : Instrument
-        Telescope and model of the images.
-    stars : sequence of StarSolution
-        The stars, with the light of these rims.
-    rims : FreeRims
-        Where the telescope has them.
-    solution : Solution
-        Joint solution, with steps of the rims from the number `first` of the shared unknowns on.
+    Steps of the rims are the shared unknowns of the solution from the number `first` on.
     """
-    steps, covariance = solution.shared[first:], solution.shared_covariance[first:, first:]
-    return [rims_at(instrument, star.light, star.stamp, steps, covariance) for star in stars] if rims.bodies else []
+    if not joint.rims.bodies:
+        return []
+    steps, covariance = joint.solution.shared[first:], joint.solution.shared_covariance[first:, first:]
+    return [rims_at(instrument, star.light, star.stamp, steps, covariance) for star in joint.stars]

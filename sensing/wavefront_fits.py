@@ -295,7 +295,8 @@ class FieldTerms(WavefrontFit):
                 rims = rims.moved(solution.shared[first:])
             return joint
 
-        stars, group, solution, rims = least_rims(shared_rims(instrument, usable.stars), fitted)
+        fit = least_rims(shared_rims(instrument, usable.stars), fitted)
+        stars, group, solution, _ = fit
         n = len(instrument.terms.requested)
         requested = (n_noll * np.arange(n_field)[:, None] + np.arange(n)).ravel()
         errors = joint_errors(instrument, usable.stars, wave_maps, stars, group, solution)
@@ -307,7 +308,7 @@ class FieldTerms(WavefrontFit):
                 errors,
                 np.array(solution.waves)[:, :n],
                 [of_star[:n] for of_star in group.maps],
-                moved_rims_of_all(instrument, stars, rims, solution, first),
+                moved_rims_of_all(instrument, fit, first),
                 slice(first - len(slopes), first),
             ),
             solution.shared[requested].reshape(-1, n),
