@@ -157,7 +157,10 @@ def _remarks(fit: DonutFit) -> list[str]:
         int(sum(bool(flag & bit) for flag in fit.flags)) for bit in (DonutFlag.DEFOCUS_SIGN, DonutFlag.AMBIGUOUS_SIDE)
     )
     if wrong:
-        remarks.append(f"{wrong} of {len(fit)} donuts fit the other side of focus: the sign of their defocus is wrong.")
+        remarks.append(
+            f"{wrong} of {len(fit)} donuts fit the other side of focus: the sign of their defocus is wrong, or their "
+            "stamps are turned or mirrored."
+        )
     if ambiguous:
         remarks.append(
             f"{ambiguous} of {len(fit)} donuts fit both sides of focus: results are those of the side given."

@@ -378,23 +378,25 @@ def donuts_command(
             threads=threads,
             progress=stage.advance,
         )
-        usable = [int(i) for i in fit.usable.nonzero()[0]]
-        off_axis = (abs(inputs.fields[usable]) > _OFF_AXIS * believed.field_radius).any()
-        if orientation_check and usable and (len(usable) >= _SEVERAL or off_axis):
-            shifts = model.detector.shifts(len(inputs.images))[usable]
+        # Stamps that are mirrored or turned may fit the other side of focus.
+        checked = fit.usable | (fit.flags & int(DonutFlag.DEFOCUS_SIGN) > 0)
+        which = [int(i) for i in checked.nonzero()[0]]
+        off_axis = (abs(inputs.fields[which]) > _OFF_AXIS * believed.field_radius).any()
+        if orientation_check and which and (len(which) >= _SEVERAL or off_axis):
+            shifts = model.detector.shifts(len(inputs.images))[which]
             orientation = check_orientation(
                 believed,
-                [inputs.images[i] for i in usable],
-                inputs.fields[usable],
+                [inputs.images[i] for i in which],
+                inputs.fields[which],
                 light,
-                sky_variance=None if sky is None else [sky[i] for i in usable],
+                sky_variance=None if sky is None else [sky[i] for i in which],
                 model=replace(model, detector=replace(model.detector, defocus=shifts)),
-                mask=[inputs.masks[i] for i in usable],
+                mask=[inputs.masks[i] for i in which],
                 projection=field_projection,
                 threads=threads,
             )
     if orientation is not None and orientation.doubtful:
-        fit = replace(fit, flags=fit.flags | fit.usable * int(DonutFlag.ORIENTATION))
+        fit = replace(fit, flags=fit.flags | checked * int(DonutFlag.ORIENTATION))
         print_warning(orientation_text(orientation, inputs))
     converted = fit.zernikes_in(cast("ZernikeConvention", convention), output_frame, frames=frames)
     motions = None

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 _SHOWN = 6
 #: Range of the residuals over their standard deviation.
 _RANGE = 5.0
+# Light of the model, as a part of the brightest, below which residuals tell the noise of the sky.
+_DARK = 0.05
 #: Meaning of the columns of the table.
 _WAVEFRONT = "wavefront beyond that of the telescope, annular Zernike term of this Noll index"
 _MEANINGS = {
@@ -342,11 +344,8 @@ def _draw(fit: DonutFit, donuts: slice | list[int] | None, ax: Axes | Figure | N
             image, model = fit.images[i], fit.model[i]
             top = float(np.nanpercentile(image, 99.5)) if np.isfinite(image).any() else 0.0
             top = top if top > 0.0 else 1.0
-            noise = np.sqrt(
-                np.maximum(np.abs(model), 1.0) + np.nanvar(fit.residuals[i][model < 0.05 * top])
-                if fit.usable[i]
-                else 1.0
-            )
+            dark = fit.residuals[i][(model < _DARK * top) & fit.used[i]] if fit.usable[i] else np.zeros(1)
+            noise = np.sqrt(np.maximum(np.abs(model), 1.0) + (dark.var() if dark.size else 0.0))
             pull = np.where(fit.used[i], fit.residuals[i] / noise, np.nan)
             shown = panels[0, column].imshow(image, cmap="viridis", vmin=0.0, vmax=top)
             panels[1, column].imshow(model, cmap="viridis", vmin=0.0, vmax=top)

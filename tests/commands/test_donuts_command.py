@@ -237,3 +237,15 @@ def test_transposed_stamps_are_said_to_be(tmp_path, monkeypatch, capsys, stamp):
     assert "orientation" in captured.out
     assert main(["donuts", "d.fits", *OPTIONS[2:], "--sky-variance", "300", "--stamp-axes", "DVCS"]) == 0
     assert "try" not in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_stamps_turned_by_half_are_not_taken_for_the_other_side_alone(tmp_path, monkeypatch, capsys, stamp):
+    """A donut turned about looks like one on the other side of focus: both are said."""
+    monkeypatch.chdir(tmp_path)
+    header = fits.Header({"FIELD_X": FIELD[0], "FIELD_Y": FIELD[1], "DEFOC_UM": 1500.0})
+    fits.PrimaryHDU(stamp[::-1, ::-1], header).writeto("d.fits")
+    assert main(["donuts", "d.fits", *OPTIONS[2:], "--sky-variance", "300"]) == 0
+    captured = capsys.readouterr()
+    assert "defocus sign, orientation" in captured.out
+    assert "try --stamp-axes=-x,-y" in captured.err
