@@ -58,7 +58,10 @@ def warn_of_other_hole(instrument: Instrument, solutions: dict[int, StarSolution
     relative = np.where(scaled, donut / np.where(scaled, model, 1.0) - 1.0, np.nan)
     # Obscurations are below 1, and differ by no more than these do.
     alike = np.abs(relative) <= _DIFFERENCE
-    if not len(donut) or alike.any() or (np.nanmin(relative, initial=0.0) < 0.0 < np.nanmax(relative, initial=0.0)):
+    mixed = np.nanmin(relative, initial=0.0) < 0.0 < np.nanmax(relative, initial=0.0)
+    # In a crowd a donut that seems to be alone may not be.
+    crowded = 2 * len(donut) < min(len(solutions), _DONUTS)
+    if not len(donut) or crowded or alike.any() or mixed:
         return
     lit = lit_obscuration(telescope, instrument.middle)
     shown = np.where(scaled, lit * (1.0 + relative), donut)

@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import yaml
 
 import pachon
 from pachon.errors import PrescriptionWarning
-from pachon.sensing.hole import lit_obscuration
+from pachon.sensing import hole
 
 FIELDS = np.zeros((1, 2))
 MODEL = pachon.DonutModel(detector=pachon.DonutDetector(20e-6, defocus=8e-3), neighbours=False, diffraction=False)
@@ -42,7 +43,7 @@ def telescope(folder, inner, obscuration):
 @pytest.mark.parametrize("stated", [0.0, 0.4])
 def test_the_obscuration_of_the_light_is_that_of_its_apertures(tmp_path, stated):
     # To half of one of 96 cells across the pupil.
-    assert lit_obscuration(telescope(tmp_path, 0.1, stated), 500e-9) == pytest.approx(0.4, abs=0.5 / 48)
+    assert hole.lit_obscuration(telescope(tmp_path, 0.1, stated), 500e-9) == pytest.approx(0.4, abs=0.5 / 48)
 
 
 @pytest.mark.long
@@ -67,3 +68,14 @@ def test_donuts_of_another_hole_are_said_to_have_it(tmp_path):
     assert "\n" not in message
     # The wrong telescope makes the seeing of the fit too wide, which moves the edges a little.
     assert (shown, lit) == (pytest.approx(0.4, abs=0.03), pytest.approx(0.5, abs=0.01))
+
+
+@pytest.mark.parametrize(("count", "said"), [(1, True), (2, True), (10, False)])
+def test_one_donut_of_a_crowd_does_not_speak_for_all(tmp_path, monkeypatch, count, said):
+    """Of many donuts with neighbours one that seems to have none may have some too."""
+    monkeypatch.setattr(hole, "_brightest_ratios", lambda *_: (np.full((1, 4), 0.2), np.full((1, 4), 0.4)))
+    instrument = SimpleNamespace(telescope=telescope(tmp_path, 0.1, 0.4), middle=500e-9)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", PrescriptionWarning)
+        hole.warn_of_other_hole(instrument, dict.fromkeys(range(count)), None)
+    assert bool(caught) == said
