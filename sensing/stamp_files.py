@@ -22,6 +22,7 @@ from astropy.table import Table
 from ..core.errors import ProductError
 from ..core.files import parsing, require_file
 from ..core.fits_files import open_fits
+from ..core.table_files import text_table
 from .inputs import SMALLEST_STAMP
 from .stamp_headers import HeaderValues, corner_of, defocus_of, detector_of, header_values, pixel_of, stamp_header
 
@@ -301,8 +302,11 @@ def sky_of_variance(variance: np.ndarray, masked: np.ndarray) -> float:
 
 
 def _table(path: Path) -> Table:
+    """Return a table of FITS, ECSV or CSV, spreadsheets' among them."""
     require_file(path, ProductError)
     with parsing(path, "cannot be read as a table", ProductError):
+        if path.suffix.lower() in (".csv", ".ecsv", ".txt"):
+            return text_table(path.read_bytes())
         return Table.read(path)
 
 

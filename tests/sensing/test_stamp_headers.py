@@ -257,3 +257,12 @@ def test_donuts_near_the_axis_tell_nothing(focused):
     check = pachon.sensing.check_orientation(tel, images, fields, 622e-9, sky_variance=300.0, model=model, threads=1)
     assert not check.doubtful
     assert not check.decided
+
+
+def test_positions_of_a_spreadsheet(tmp_path):
+    """Semicolons, and the byte order mark of spreadsheets before the name of the first column."""
+    image = np.arange(150.0 * 160.0).reshape(150, 160)
+    fits.PrimaryHDU(image).writeto(tmp_path / "ccd.fits")
+    (tmp_path / "stars.csv").write_text("\ufeffx;y;field_x;field_y\n85;65;0.6;0.9\n")
+    stamps = read_stamps(tmp_path / "ccd.fits", positions=tmp_path / "stars.csv", size=91)
+    np.testing.assert_array_equal(stamps.images[0], image[20:111, 40:131])
