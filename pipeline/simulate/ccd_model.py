@@ -27,7 +27,6 @@ from .photometry import effective_fwhm, signal_to_noise
 from .sky_axes import sky_jacobians
 from .star_field import StarField
 
-
 #: Stamps measured by one call: the memory of more would be mapped anew each time, which takes as long as measuring.
 _STAMPS_TOGETHER = 1000
 

@@ -42,7 +42,7 @@ _FIRST_RING = 0.3
 #: Side of the grid of a layer over the outer scale or the pupil, at least: longer modes are left out.
 _LAYER_SIDE = 8.0
 #: Largest frequency of Zernikes times the diameter of the pupil, and samples of their tables: beyond it Z4 to Z10 have
-#: 1 % of their variance, Z11, the smallest, a seventh.
+#: 1 % of their variance, Z11, the smallest, a seventh to a fifth.
 _HIGHEST = 4.0
 _TABLE = 2048
 #: Factor of modes without frequency along x, and with the highest one: the inverse transform takes the mean of those at
@@ -162,7 +162,7 @@ def moment_spectrum(
 
 
 def _factors(spectra: np.ndarray, scale: float) -> tuple[tuple[np.ndarray, ...], ...]:
-    """Return lower Cholesky factors of spectra of PAIRS [6, size, size // 2 + 1] in units, with the gain of splines.
+    """Return lower Cholesky factors of spectra of PAIRS [6, size, size // 2 + 1], with the gain of splines.
 
     The spectra are in units of a scale, and are overwritten.
     """
