@@ -27,6 +27,9 @@ from .photometry import effective_fwhm, signal_to_noise
 from .sky_axes import sky_jacobians
 from .star_field import StarField
 
+#: Stamps measured by one call: the memory of more would be mapped anew each time, which takes as long as measuring.
+_STAMPS_TOGETHER = 1000
+
 
 class ModelledMoments(NamedTuple):
     """Adaptive moments of stars, and of their models, as :class:`.HoldoutStars` has them, each [n]."""
@@ -233,11 +236,18 @@ def _jacobians(experiment: Experiment, ccds: Sequence[_ComparedCcd]) -> list[lis
 
 
 def _adaptive_of(experiment: Experiment, stamps: Sequence[np.ndarray], pixel_scale: float) -> list[AdaptiveMoments]:
-    """Measure groups of stamps of stars by one call, which costs as much as twenty stamps."""
+    """Measure groups of stamps of stars, many by one call, which costs as much as twenty stamps."""
     # From near the width of stars the iteration takes half the steps. Other CCDs are exposed meanwhile.
-    start = experiment.weight_fwhm / FWHM_PER_RMS
-    together = adaptive_moments(np.concatenate(stamps), pixel_scale, start_sigma=start, threads=1)
-    return [rows_of(together, rows) for rows in slices_of(stamps)]
+    measure = partial(
+        adaptive_moments, pixel_scale=pixel_scale, start_sigma=experiment.weight_fwhm / FWHM_PER_RMS, threads=1
+    )
+    batches = np.cumsum([len(group) for group in stamps]) // _STAMPS_TOGETHER
+    moments = []
+    for batch in np.unique(batches):
+        groups = [group for group, of_group in zip(stamps, batches, strict=True) if of_group == batch]
+        together = measure(np.concatenate(groups))
+        moments += [rows_of(together, rows) for rows in slices_of(groups)]
+    return moments
 
 
 def _fit(ccd: _ComparedCcd) -> CcdFit:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...core.launch import launch
-from ...core.row_sum_kernels import LANES, columns
+from ...core.row_sum_kernels import columns
 from ...core.row_sums import in_packets
 from ...core.warp_arrays import warp_array
 from .pixel_kernels import add_powers
@@ -26,8 +26,7 @@ def log_powers_and_variances(
     # Variances of the pixels that fill up the last packet are 1.
     of_pixels = in_packets(relative[None])[:, 0]
     sums = np.empty((2, len(packets), len(factors)))
-    room = np.empty((len(packets), 2, LANES))
     arrays = [warp_array(packets, columns), warp_array(spectrum), warp_array(of_pixels, columns), warp_array(factors)]
-    launch(add_powers, len(packets), [*arrays, warp_array(room, columns), *map(warp_array, sums)], threads=1)
+    launch(add_powers, len(packets), [*arrays, *map(warp_array, sums)], threads=1)
     log_powers, log_variances = sums.sum(axis=1)
     return log_powers, log_variances

@@ -40,8 +40,9 @@ PIXEL_COLUMNS = {
     "AREA": ("pixel2", "effective area of the PSF"),
 }
 _ROW_COLUMNS = tuple(name for name in rows.COLUMNS if name not in ("visitId", "band"))
-#: Stars of the CCDs that are exposed and modelled together: a visit is computed whole or not at all.
-_STARS_TOGETHER = 3000
+#: Stars of the CCDs that are exposed and modelled together: a visit is computed whole or not at all. An array of their
+#: stamps has 20 MB; beyond 32 MB each is mapped anew.
+_STARS_TOGETHER = 1500
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from ...core.launch import launch
 from ...core.random_streams import stream
 from ...core.warp_arrays import warp_array
 from ...models.zernike_polynomials import noll_to_nm
-from .field_kernels import add_wavefronts, pairs, read_splines, spread_over_grid, zernikes
+from .field_kernels import add_wavefronts, factor_spectra, pairs, read_splines, spread_over_grid, zernikes
 from .mean_wavefront import mean_wavefront_covariance, radial_transform
 from .moment_covariance import PAIRS, ExposedAir, MomentResponse, as_matrices, moment_covariance
 from .spline import stencil_gain
@@ -41,9 +41,13 @@ _SPOKES = 20
 _FIRST_RING = 0.3
 #: Side of the grid of a layer over the outer scale or the pupil, at least: longer modes are left out.
 _LAYER_SIDE = 8.0
-#: Largest frequency of Zernikes times the diameter of the pupil, and samples of their tables.
-_HIGHEST = 12.0
+#: Largest frequency of Zernikes times the diameter of the pupil, and samples of their tables: beyond it Z4 to Z10 have
+#: 1 % of their variance, Z11, the smallest, a seventh to a fifth.
+_HIGHEST = 4.0
 _TABLE = 2048
+#: Factor of modes without frequency along x, and with the highest one: the inverse transform takes the mean of those at
+#: a frequency along y and at its opposite.
+_BOTH_SIGNS = np.float32(math.sqrt(2.0))
 
 
 class FieldGrid(NamedTuple):
@@ -111,7 +115,7 @@ def draw_exposure(
     factors, shared = moment_spectrum(air, response, grid)
     random = stream(seed, "atmosphere", epoch, "moments")
     common = shared @ random.standard_normal(3)
-    modes = [scipy.fft.rfft2(random.standard_normal((grid.size, grid.size), dtype=np.float32)) for _ in range(3)]
+    modes = [_white_modes(random, grid.size, grid.size // 2 + 1, grid.size) for _ in range(3)]
     moments = np.empty((3, grid.size, grid.size), dtype=np.float32)
     for i, row in enumerate(factors):
         moments[i] = scipy.fft.irfft2(sum(f * m for f, m in zip(row, modes, strict=False)), s=(grid.size, grid.size))
@@ -153,37 +157,37 @@ def moment_spectrum(
             warp_array(covariance, wp.float32),
         ],
     )
-    spectra = scipy.fft.rfft2(covariance).real
-    gain = _spline_gain(grid.size) * np.float32(math.sqrt(scale))
-    return _cholesky(spectra, gain), np.linalg.cholesky(shared + 1e-12 * scale * np.eye(3))
+    spectra = np.ascontiguousarray(scipy.fft.rfft2(covariance).real)
+    return _factors(spectra, scale), np.linalg.cholesky(shared + 1e-12 * scale * np.eye(3))
 
 
-def _cholesky(spectra: np.ndarray, gain: np.ndarray) -> tuple[tuple[np.ndarray, ...], ...]:
-    """Return lower Cholesky factors of matrices of PAIRS [6, ...], negative remainders taken as zero, times a gain."""
-    pp, qq, ss, pq, ps, qs = spectra
+def _factors(spectra: np.ndarray, scale: float) -> tuple[tuple[np.ndarray, ...], ...]:
+    """Return lower Cholesky factors of spectra of PAIRS [6, size, size // 2 + 1], with the gain of splines.
 
-    def over(values: np.ndarray, root: np.ndarray, bound: np.ndarray) -> np.ndarray:
-        quotient = np.divide(values, root, out=np.zeros_like(values), where=root > 0.0)
-        return np.clip(quotient, -bound, bound)
-
-    def root(values: np.ndarray) -> np.ndarray:
-        return np.sqrt(np.maximum(values, 0.0))
-
-    first = root(pp)
-    second = over(pq, first, root(qq))
-    third = over(ps, first, root(ss))
-    middle = root(qq - second**2)
-    mixed = over(qs - second * third, middle, root(ss - third**2))
-    last = root(ss - third**2 - mixed**2)
-    # Without negative remainders the variance would be a per cent too large.
-    squares = first**2 + second**2 + third**2 + middle**2 + mixed**2 + last**2
-    gain = gain * np.float32(math.sqrt(max(_plane_sum(pp + qq + ss), 0.0) / max(_plane_sum(squares), 1e-30)))
-    return (gain * first,), (gain * second, gain * middle), (gain * third, gain * mixed, gain * last)
+    The spectra are in units of a scale, and are overwritten.
+    """
+    size, sums = spectra.shape[1], np.zeros((spectra.shape[1], 2))
+    launch(
+        factor_spectra,
+        size,
+        [warp_array(_spline_gain(size), wp.float32), warp_array(spectra, wp.float32), warp_array(sums)],
+    )
+    wanted, drawn = sums.sum(axis=0)
+    # Negative remainders count as zero: without this the variance would be a per cent too large.
+    spectra *= np.float32(math.sqrt(scale * max(wanted, 0.0) / max(drawn, 1e-30)))
+    first, second, middle, third, mixed, last = spectra
+    return (first,), (second, middle), (third, mixed, last)
 
 
-def _plane_sum(half: np.ndarray) -> float:
-    """Return the sum over all frequencies of values at those of a real transform, of an even number of samples."""
-    return float(2.0 * half.sum(dtype=np.float64) - half[:, [0, -1]].sum(dtype=np.float64))
+def _white_modes(random: np.random.Generator, rows: int, columns: int, size: int) -> np.ndarray:
+    """Return modes of the real transform of white noise on a grid of a size, complex64, [rows, columns].
+
+    Columns start at no frequency along x.
+    """
+    modes = random.standard_normal((rows, columns, 2), dtype=np.float32).view(np.complex64)[..., 0]
+    modes *= np.float32(math.sqrt(0.5) * size)
+    modes[:, :: size // 2] *= _BOTH_SIGNS
+    return modes
 
 
 def _positive(matrix: np.ndarray) -> np.ndarray:
@@ -193,8 +197,8 @@ def _positive(matrix: np.ndarray) -> np.ndarray:
 
 
 def _spline_gain(size: int) -> np.ndarray:
-    kx, ky = 2.0 * np.pi * np.fft.rfftfreq(size), 2.0 * np.pi * np.fft.fftfreq(size)
-    return stencil_gain(kx, ky[:, None], "spline").astype(np.float32)
+    """Return the gain of splines along one axis, for the frequencies of a transform, float32, [size]."""
+    return stencil_gain(2.0 * np.pi * np.fft.fftfreq(size), np.zeros(()), "spline").astype(np.float32)
 
 
 def _grid_size(wanted: float) -> int:
@@ -234,10 +238,12 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
     """Draw the fields of some layers on a common grid of a side [rad]."""
     distance = np.array([air.altitudes[n] for n in layers])
     size = _grid_size(_SAMPLES * side * distance.max() / air.diameter)
-    noise = np.empty((len(layers), size, size // 2 + 1), dtype=np.complex64)
-    for k, n in enumerate(layers):
-        random = stream(seed, "atmosphere", epoch, n, "mean wavefront")
-        noise[k] = scipy.fft.rfft2(random.standard_normal((size, size), dtype=np.float32))
+    # Of each layer only modes that its Zernikes have.
+    reach = np.minimum(np.ceil(_HIGHEST * side * distance / air.diameter).astype(int), size // 2 - 1)
+    noise = [
+        _white_modes(stream(seed, "atmosphere", epoch, n, "mean wavefront"), 2 * k + 1, k + 1, size)
+        for n, k in zip(layers, reach.tolist(), strict=True)
+    ]
     # In microns: powers of path in metres are below the numbers of float32.
     scale = 1e6 * math.sqrt(float(path_spectrum(0.0, air.r0, air.outer_scale)) * air.outer_scale ** (-11.0 / 3.0))
     weights = np.array([air.weights[n] for n in layers])
@@ -250,7 +256,9 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
         add_wavefronts,
         size,
         [
-            warp_array(noise, wp.vec2f),
+            warp_array(np.concatenate([modes.ravel() for modes in noise]), wp.vec2f),
+            warp_array(np.cumsum([0, *(modes.size for modes in noise[:-1])]), wp.int32),
+            warp_array(reach, wp.int32),
             warp_array(distance, wp.float32),
             warp_array(drift, wp.float32),
             warp_array(scale * size * np.sqrt(weights) / (distance * side), wp.float32),
@@ -258,8 +266,9 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
             warp_array(radial.T, zernikes),
             air.diameter * (_TABLE - 1) / _HIGHEST,
             warp_array([noll_to_nm(j)[1] for j in NOLL], wp.int32),
+            warp_array(_spline_gain(size), wp.float32),
+            1e-6,
             warp_array(spectrum, wp.vec2f),
         ],
     )
-    spectrum *= np.float32(1e-6) * _spline_gain(size)
     return SplineFields(side, scipy.fft.irfft2(spectrum, s=(size, size), overwrite_x=True))

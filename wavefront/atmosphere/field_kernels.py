@@ -68,21 +68,88 @@ def spread_over_grid(
 
 
 @wp.func
-def multiple_angle(direction: wp.vec2f, m: wp.int32):
-    """Cosine and sine of a whole multiple of the angle of a unit vector."""
-    cosine = wp.float32(1.0)
-    sine = wp.float32(0.0)
-    for _ in range(m):
-        turned = cosine * direction[0] - sine * direction[1]
-        sine = cosine * direction[1] + sine * direction[0]
-        cosine = turned
-    return cosine, sine
+def root(values: wp.float32):
+    """Square root, zero of what is negative."""
+    return wp.sqrt(wp.max(values, wp.float32(0.0)))
+
+
+@wp.func
+def bounded_quotient(value: wp.float32, divisor: wp.float32, bound: wp.float32):
+    """Quotient within a bound of either sign; zero where the divisor is."""
+    quotient = wp.float32(0.0)
+    if divisor > wp.float32(0.0):
+        quotient = wp.clamp(value / divisor, -bound, bound)
+    return quotient
+
+
+@wp.kernel
+def factor_spectra(
+    first: wp.int32,
+    gain: wp.array(dtype=wp.float32),
+    spectra: wp.array3d(dtype=wp.float32),
+    sums: wp.array2d(dtype=wp.float64),
+):
+    """Replace spectra in one row of frequencies by their lower Cholesky factors; negative remainders count as zero.
+
+    Arguments: gain [row]: of splines along either axis; spectra [pair, row, column]: pp, qq, ss, pq, ps, qs, and the
+    factors p, q by p, q, s by p, s by q, s; sums [row, 2]: of the variances, and of those that the factors have without
+    the gain, at frequencies of both signs.
+    """
+    row = first + wp.tid()
+    last = spectra.shape[2] - 1
+    wanted = wp.float64(0.0)
+    drawn = wp.float64(0.0)
+    for column in range(spectra.shape[2]):
+        pp = spectra[0, row, column]
+        qq = spectra[1, row, column]
+        ss = spectra[2, row, column]
+        of_p = root(pp)
+        q_by_p = bounded_quotient(spectra[3, row, column], of_p, root(qq))
+        s_by_p = bounded_quotient(spectra[4, row, column], of_p, root(ss))
+        of_q = root(qq - q_by_p * q_by_p)
+        remainder = ss - s_by_p * s_by_p
+        s_by_q = bounded_quotient(spectra[5, row, column] - q_by_p * s_by_p, of_q, root(remainder))
+        of_s = root(remainder - s_by_q * s_by_q)
+        signs = wp.where(column == 0 or column == last, wp.float64(1.0), wp.float64(2.0))
+        squares = of_p * of_p + q_by_p * q_by_p + of_q * of_q + s_by_p * s_by_p + s_by_q * s_by_q + of_s * of_s
+        wanted = wanted + signs * wp.float64(pp + qq + ss)
+        drawn = drawn + signs * wp.float64(squares)
+        scale = gain[row] * gain[column]
+        spectra[0, row, column] = scale * of_p
+        spectra[1, row, column] = scale * q_by_p
+        spectra[2, row, column] = scale * of_q
+        spectra[3, row, column] = scale * s_by_p
+        spectra[4, row, column] = scale * s_by_q
+        spectra[5, row, column] = scale * of_s
+    sums[row, 0] = wanted
+    sums[row, 1] = drawn
+
+
+@wp.func
+def multiple_angles(direction: wp.vec2f):
+    """Cosine and sine of multiples of the angle of a unit vector: of 0, 1, 2 and 3 times it."""
+    cosine = direction[0]
+    sine = direction[1]
+    cosine_two = cosine * cosine - sine * sine
+    sine_two = wp.float32(2.0) * sine * cosine
+    return zernikes(
+        wp.float32(1.0),
+        wp.float32(0.0),
+        cosine,
+        sine,
+        cosine_two,
+        sine_two,
+        cosine_two * cosine - sine_two * sine,
+        sine_two * cosine + cosine_two * sine,
+    )
 
 
 @wp.kernel
 def add_wavefronts(
     first: wp.int32,
-    noise: wp.array3d(dtype=wp.vec2f),
+    noise: wp.array(dtype=wp.vec2f),
+    start: wp.array(dtype=wp.int32),
+    reach: wp.array(dtype=wp.int32),
     distance: wp.array(dtype=wp.float32),
     drift: wp.array2d(dtype=wp.float32),
     strength: wp.array(dtype=wp.float32),
@@ -90,15 +157,19 @@ def add_wavefronts(
     radial: wp.array(dtype=zernikes),
     per_frequency: wp.float32,
     order: wp.array(dtype=wp.int32),
+    gain: wp.array(dtype=wp.float32),
+    unit: wp.float32,
     spectrum: wp.array3d(dtype=wp.vec2f),
 ):
     """Sum over layers the transforms of Zernikes of the mean wavefront, for one row of frequencies of the field.
 
-    Arguments: noise [layer, row, column]: transform of white noise; distance [layer] along the line of sight [m];
-    drift [layer, 2] in the exposure [m]; strength [layer]: amplitude of a mode but for the power of its frequency;
-    frequency_step of the field [cycles/rad]; radial [k]: mean over the pupil of a term's radial part times a wave, with
-    the root of the power of the frequency, against the frequency, whose table has per_frequency steps a cycle/m; order
-    [term] m of the Zernikes, negative for sines; spectrum [term, row, column].
+    Arguments: noise: transforms of white noise, from start [layer] on those of a layer, rows -reach to reach and
+    columns 0 to reach [layer]; distance [layer] along the line of sight [m]; drift [layer, 2] in the exposure [m];
+    strength [layer]: amplitude of a mode but for the power of its frequency; frequency_step of the field [cycles/rad];
+    radial [k]: mean over the pupil of a term's radial part times a wave, with the root of the power of the frequency,
+    against the frequency, whose table has per_frequency steps a cycle/m; order [term] m of the Zernikes, -3 to 3,
+    negative for sines; gain [row] of splines along either axis; unit of the strength in that of the results; spectrum
+    [term, row, column].
     """
     row = first + wp.tid()
     size = spectrum.shape[1]
@@ -107,29 +178,31 @@ def add_wavefronts(
     for column in range(spectrum.shape[2]):
         re = zernikes()
         im = zernikes()
-        around = zernikes()
-        if (row > 0 or column > 0) and 2 * column < size and 2 * row != size:
+        if row > 0 or column > 0:
             across = frequency_step * wp.float32(column)
             up = frequency_step * wp.float32(signed)
             length = wp.sqrt(across * across + up * up)
-            direction = wp.vec2f(across / length, up / length)
-            for term in range(TERMS):
-                cosine, sine = multiple_angle(direction, wp.abs(order[term]))
-                around[term] = wp.where(order[term] < 0, sine, cosine)
             for layer in range(distance.shape[0]):
                 at = length / distance[layer] * per_frequency
-                if at < last:
+                bound = reach[layer]
+                if at < last and column <= bound and wp.abs(signed) <= bound:
                     nu_x = across / distance[layer]
                     nu_y = up / distance[layer]
                     turns = wp.float32(wp.PI) * (nu_x * drift[layer, 0] + nu_y * drift[layer, 1])
                     smear = wp.float32(1.0)
                     if wp.abs(turns) > wp.float32(1e-3):
                         smear = wp.sin(turns) / turns
-                    mode = strength[layer] * smear * noise[layer, row, column]
+                    mode = strength[layer] * smear * noise[start[layer] + (signed + bound) * (bound + 1) + column]
                     knot = wp.int32(at)
-                    gain = wp.cw_mul(around, radial[knot] + (at - wp.float32(knot)) * (radial[knot + 1] - radial[knot]))
-                    re = re + mode[0] * gain
-                    im = im + mode[1] * gain
+                    transform = radial[knot] + (at - wp.float32(knot)) * (radial[knot + 1] - radial[knot])
+                    re = re + mode[0] * transform
+                    im = im + mode[1] * transform
+            angles = multiple_angles(wp.vec2f(across / length, up / length))
+            scale = unit * gain[row] * gain[column]
+            for term in range(TERMS):
+                around = scale * angles[2 * wp.abs(order[term]) + wp.where(order[term] < 0, 1, 0)]
+                re[term] = around * re[term]
+                im[term] = around * im[term]
         for term in range(TERMS):
             value = wp.vec2f(re[term], im[term])
             # A layer's place runs against the field: the conjugate of i^m.

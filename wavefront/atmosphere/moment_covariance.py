@@ -29,7 +29,7 @@ import warp as wp
 from ...core.launch import launch
 from ...core.warp_arrays import warp_array
 from .atmosphere import Atmosphere
-from .moment_kernels import LANES, average_products, baselines
+from .moment_kernels import LANES, SLOPES, TERMS, average_products, baselines, products_with_mean_slope
 from .slope_covariance import slope_covariance
 from .turbulence import diffraction_otf
 
@@ -157,9 +157,9 @@ def moment_covariance(air: ExposedAir, lags: np.ndarray, threads: int | None = N
     lag, delays = np.asarray(lags, dtype=np.float64).reshape(-1, 2), _Delays.of(air)
     # All stars share the layers on the ground.
     ground = np.zeros(delays.baseline.shape, dtype=np.float32)
-    _, common = _averages(air.on_ground(), np.zeros((1, 2)), delays, np.zeros((0, 12)), ground, threads)
+    _, common = _averages(air.on_ground(), np.zeros((1, 2)), delays, np.zeros((0, TERMS)), ground, threads)
     squares, slopes = _averages(air, lag, delays, common[0], ground, threads)
-    second = squares[:, :6] - _by_mean_slope(slopes, delays, air.exposure)
+    second = squares[:, :6] - _by_mean_slope(slopes, delays, air.exposure, threads)
     # The fourth powers' own factors: 1/6 of p and q, 1 of s.
     fourth = squares[:, 6:] * np.array([1.0 / 6.0, 1.0 / 6.0, 1.0])
     return MomentCovariance(second * _MICRO**4, fourth * _MICRO**8)
@@ -174,7 +174,7 @@ def _averages(
     """
     table = slope_covariance(air.r0, air.outer_scale, air.cutoff)
     squares = np.zeros((len(lag), 9))
-    terms = np.zeros((len(lag), len(delays.time), 3 if len(common) else 12))
+    terms = np.zeros((len(lag), len(delays.time), SLOPES if len(common) else TERMS))
     launch(
         average_products,
         len(lag),
@@ -187,7 +187,8 @@ def _averages(
             warp_array(air.altitudes),
             warp_array(np.array(air.velocities, dtype=np.float64).reshape(-1, 2)),
             warp_array(air.weights, wp.float32),
-            warp_array(np.stack([table.isotropic, table.directed], axis=1) / _MICRO**2, wp.vec2f),
+            warp_array(table.isotropic / _MICRO**2, wp.float32),
+            warp_array(table.directed / _MICRO**2, wp.float32),
             1.0 / table.step,
             air.diameter + table.reach,
             warp_array(common),
@@ -251,28 +252,27 @@ def _pupil_baselines(diameter: float, obscuration: float, spacing: float, count:
     return np.moveaxis(packed.reshape(count, 3, -1, LANES), 2, 1)
 
 
-def _by_mean_slope(slopes: np.ndarray, delays: _Delays, exposure: float) -> np.ndarray:
+def _by_mean_slope(slopes: np.ndarray, delays: _Delays, exposure: float, threads: int | None) -> np.ndarray:
     """Return what the moments' covariances lose by the mean slope, of :data:`PAIRS`, [n_lag, 6].
 
-    ``slopes`` [n_lag, n_delay, 3] are covariances a, b, c of slopes a delay apart, means over the baselines.
+    ``slopes`` [n_lag, n_delay, 3] are covariances a, b, c of slopes a delay apart, means over the baselines; they are
+    overwritten.
     """
-    total = np.concatenate([np.zeros((len(slopes), 1, 3)), np.cumsum(slopes * delays.width[:, None], axis=1)], axis=1)
-    count = len(delays.time) // 2
     edges = np.concatenate([[-exposure], np.cumsum(delays.width) - exposure])
-    # A moment t with the mean slope: delays from t - T to t.
-    moment = edges[count:]
-    start = np.searchsorted(edges, moment - exposure).clip(1, len(edges) - 1)
-    part = (moment - exposure - edges[start - 1]) / np.diff(edges)[start - 1]
-    before = total[:, start - 1] + part[:, None] * (total[:, start] - total[:, start - 1])
-    with_mean = (total[:, count:] - before) / exposure
-    width = np.diff(moment)[:, None] / exposure
-    products = _products(0.5 * (with_mean[:, 1:] + with_mean[:, :-1]))
-    mean = (0.5 * (with_mean[:, 1:] + with_mean[:, :-1]) * width).sum(axis=1)
-    return np.asarray(2.0 * (products * width).sum(axis=1) - _products(mean))
-
-
-def _products(slopes: np.ndarray) -> np.ndarray:
-    """Return Wick's products of covariances a, b, c of slopes [..., 3], of :data:`PAIRS`, [..., 6]."""
-    a, b, c = np.moveaxis(slopes, -1, 0)
-    pp, qq, ss = 2.0 * (a * a + c * c - 2.0 * b * b), 4.0 * (a * c + b * b), 2.0 * (a * a + 2.0 * b * b + c * c)
-    return np.stack([pp, qq, ss, 4.0 * b * (a - c), 2.0 * (a * a - c * c), 4.0 * b * (a + c)], axis=-1)
+    start_delay = edges[len(delays.time) // 2 :] - exposure
+    start = np.searchsorted(edges, start_delay).clip(1, len(edges) - 1) - 1
+    products = np.zeros((len(slopes), len(PAIRS)))
+    launch(
+        products_with_mean_slope,
+        len(slopes),
+        [
+            warp_array(slopes, wp.vec3d),
+            warp_array(delays.width),
+            warp_array(start, wp.int32),
+            warp_array((start_delay - edges[start]) / delays.width[start]),
+            exposure,
+            warp_array(products),
+        ],
+        threads=threads,
+    )
+    return products

@@ -1,4 +1,7 @@
-"""Kernel of the statistics of exposures: products of slope covariances."""
+"""Kernel of the statistics of exposures: products of slope covariances.
+
+The loop over baselines is written in C with vectors of the compiler, whose sums stay in the processor's registers.
+"""
 
 from __future__ import annotations
 
@@ -11,23 +14,102 @@ wp.set_module_options(FORWARD_OPTIONS)
 #: Baselines in one packet.
 LANES = 16
 baselines = wp.types.vector(LANES, wp.float32)
-#: Products of a slope covariance: those of the second order, and of the fourth.
-product_sums = wp.types.vector(9, wp.float64)
+#: Averages of one delay: slope covariances a, b, c, and their products of the second order, and of the fourth.
+TERMS = 12
+delay_terms = wp.types.vector(TERMS, wp.float64)
+#: Number of slope covariances among them.
+SLOPES = wp.constant(3)
+#: Products pp, qq, ss, pq, ps, qs.
+pair_products = wp.types.vector(6, wp.float64)
+
+_BASELINE_LOOP = f"""
+    #pragma clang fp contract(fast)
+    typedef float packet __attribute__((vector_size({4 * LANES}), aligned(4)));
+    const int last = isotropic.shape[0] - 1;
+    packet sum[{TERMS}] = {{}};
+    for (int k = start; k < end; ++k) {{
+        const packet* point = (const packet*)baseline.data + 3 * k;
+        packet* shared = (packet*)ground.data + 3 * k;
+        packet a = shared[0];
+        packet b = shared[1];
+        packet c = shared[2];
+        for (int n = 0; n < active; ++n) {{
+            const float* center = place.data + 3 * n;
+            const packet x = point[0] - center[0];
+            const packet y = point[1] - center[1];
+            const packet xx = x * x;
+            const packet yy = y * y;
+            const packet separation = xx + yy;
+            float squares[{LANES}], from_isotropic[{LANES}], from_directed[{LANES}];
+            *(packet*)squares = separation;
+            for (int i = 0; i < {LANES}; ++i) {{
+                const int nearest = (int)(__builtin_sqrtf(squares[i]) * per_step + 0.5f);
+                const int knot = nearest < last ? nearest : last;
+                from_isotropic[i] = isotropic.data[knot];
+                from_directed[i] = directed.data[knot];
+            }}
+            packet same = *(packet*)from_isotropic, other = *(packet*)from_directed;
+            same = center[2] * same;
+            other = center[2] * other;
+            const packet difference = other * (xx - yy);
+            a = a + same + difference;
+            c = c + same - difference;
+            b = b + 2.0f * other * x * y;
+        }}
+        if (of_ground) {{
+            shared[0] = a;
+            shared[1] = b;
+            shared[2] = c;
+        }}
+        const packet w = point[2];
+        const packet aa = a * a, bb = b * b, cc = c * c, wb = w * b;
+        // Along the axes, and along the diagonals.
+        const packet middle = 0.5f * (a + c), turned = 0.5f * (c - a);
+        const packet rising = (middle + b) * (middle + b), falling = (middle - b) * (middle - b);
+        const packet square = middle * middle, mixed = turned * turned;
+        sum[0] += w * a;
+        sum[1] += wb;
+        sum[2] += w * c;
+        sum[3] += 2.0f * w * (aa + cc - 2.0f * bb);
+        sum[4] += 4.0f * w * (a * c + bb);
+        sum[5] += 2.0f * w * (aa + 2.0f * bb + cc);
+        sum[6] += 4.0f * wb * (a - c);
+        sum[7] += 2.0f * w * (aa - cc);
+        sum[8] += 4.0f * wb * (a + c);
+        sum[9] += w * (aa * aa + cc * cc - 2.0f * bb * bb);
+        sum[10] += w * (rising * rising + falling * falling - 2.0f * mixed * mixed);
+        sum[11] += w * square * square;
+    }}
+    wp::vec_t<{TERMS}, wp::float64> averages;
+    for (int k = 0; k < {TERMS}; ++k) {{
+        float total = 0.0f;
+        for (int i = 0; i < {LANES}; ++i)
+            total += sum[k][i];
+        averages.c[k] = total;
+    }}
+    return averages;
+"""
 
 
-@wp.func
-def square(values: baselines):
-    """Squares of the lanes."""
-    return wp.cw_mul(values, values)
+@wp.func_native(_BASELINE_LOOP)
+def average_over_baselines(
+    baseline: wp.array2d(dtype=baselines),
+    start: wp.int32,
+    end: wp.int32,
+    ground: wp.array2d(dtype=baselines),
+    of_ground: bool,
+    place: wp.array2d(dtype=wp.float32),
+    active: wp.int32,
+    isotropic: wp.array(dtype=wp.float32),
+    directed: wp.array(dtype=wp.float32),
+    per_step: wp.float32,
+) -> delay_terms:
+    """Average slope covariances and their products over the baselines of one delay, packets start to end.
 
-
-@wp.func
-def lane_sum(values: baselines):
-    """Sum over the lanes."""
-    total = wp.float32(0.0)
-    for i in range(LANES):
-        total = total + values[i]
-    return total
+    Arguments, beside those of :func:`average_products`: whether to store the covariances as those of the ground; place
+    [layer, 3] of the first, active layers: x, y of their centres [m], and weights.
+    """
+    ...
 
 
 @wp.kernel
@@ -41,7 +123,8 @@ def average_products(
     altitude: wp.array(dtype=wp.float64),
     velocity: wp.array2d(dtype=wp.float64),
     weight: wp.array(dtype=wp.float32),
-    table: wp.array(dtype=wp.vec2f),
+    isotropic: wp.array(dtype=wp.float32),
+    directed: wp.array(dtype=wp.float32),
     per_step: wp.float32,
     farthest: wp.float64,
     common: wp.array2d(dtype=wp.float64),
@@ -54,116 +137,109 @@ def average_products(
 
     Arguments: lag [lag, 2] of the stars' field slopes [rad]; delay [s] and its weight [delay]; packet_start [delay + 1]
     of the packets of each delay; baseline [packet, 3] of the pupil: x, y [m], weight of sum 1; altitude, velocity,
-    weight of the layers; table: the slopes' covariance, isotropic and directed, zero at the end; per_step: one over its
-    step [1/m]; farthest: distance of a layer's centre from which on none of its baselines is within the table [m];
-    common [delay, 12]: the terms of layers on the ground alone; where it is empty, these are computed too; ground
+    weight of the layers; isotropic and directed: tables of the slopes' covariance, zero at the end; per_step: one over
+    their step [1/m]; farthest: distance of a layer's centre from which on none of its baselines is within the tables
+    [m]; common [delay, 12]: the terms of layers on the ground alone; where it is empty, these are computed too; ground
     [packet, 3]: covariances a, b, c of these layers, which are computed with the terms, and zero before; place [lag,
     layer, 3]: room; squares [lag, 9]: averages of pp, qq, ss, pq, ps, qs, and of fourth powers: a^4 + c^4 - 2 b^4, the
     same at 45 degrees, (a + c)^4 / 16; terms [lag, delay, 3 or 12]: averages of a, b, c over the baselines, and where
-    there is room what the delay adds to the squares. p = xx - yy, q = 2 xy, s = xx + yy.
+    there is room of the products that make the squares. p = xx - yy, q = 2 xy, s = xx + yy.
     """
     item = first + wp.tid()
-    n_layer = altitude.shape[0]
-    last = table.shape[0] - 1
-    two = wp.float32(2.0)
-    half = wp.float32(0.5)
-    total = product_sums()
+    of_ground = common.shape[0] == 0
+    averages = delay_terms()
+    total = delay_terms()
     for t in range(delay.shape[0]):
         active = wp.int32(0)
-        for n in range(n_layer):
-            apart = altitude[n] > wp.float64(0.0) or common.shape[0] == 0
+        for n in range(altitude.shape[0]):
             center_x = altitude[n] * lag[item, 0] + velocity[n, 0] * delay[t]
             center_y = altitude[n] * lag[item, 1] + velocity[n, 1] * delay[t]
+            apart = altitude[n] > wp.float64(0.0) or of_ground
             if apart and center_x * center_x + center_y * center_y < farthest * farthest:
                 place[item, active, 0] = wp.float32(center_x)
                 place[item, active, 1] = wp.float32(center_y)
                 place[item, active, 2] = weight[n]
                 active = active + 1
-        if active == 0 and common.shape[0] > 0:
-            for k in range(9):
-                total[k] = total[k] + common[t, 3 + k]
-            for k in range(3):
-                terms[item, t, k] = common[t, k]
-        elif active > 0:
-            pp = baselines()
-            qq = baselines()
-            ss = baselines()
-            pq = baselines()
-            ps = baselines()
-            qs = baselines()
-            along = baselines()
-            across = baselines()
-            round = baselines()
-            mean_a = baselines()
-            mean_b = baselines()
-            mean_c = baselines()
-            for packet in range(packet_start[t], packet_start[t + 1]):
-                # Sums, since a load alone would be an alias of the array.
-                a = baselines() + ground[packet, 0]
-                b = baselines() + ground[packet, 1]
-                c = baselines() + ground[packet, 2]
-                for n in range(active):
-                    x = baseline[packet, 0] - baselines(place[item, n, 0])
-                    y = baseline[packet, 1] - baselines(place[item, n, 1])
-                    layer = place[item, n, 2]
-                    xx = square(x)
-                    yy = square(y)
-                    separation = xx + yy
-                    same = baselines()
-                    other = baselines()
-                    for i in range(LANES):
-                        knot = wp.min(wp.int32(wp.sqrt(separation[i]) * per_step + wp.float32(0.5)), last)
-                        entry = table[knot]
-                        same[i] = entry[0]
-                        other[i] = entry[1]
-                    same = layer * same
-                    other = layer * other
-                    difference = wp.cw_mul(other, xx - yy)
-                    a = a + same + difference
-                    c = c + same - difference
-                    b = b + two * wp.cw_mul(other, wp.cw_mul(x, y))
-                if common.shape[0] == 0:
-                    ground[packet, 0] = a
-                    ground[packet, 1] = b
-                    ground[packet, 2] = c
-                w = baseline[packet, 2]
-                aa = square(a)
-                bb = square(b)
-                cc = square(c)
-                wb = wp.cw_mul(w, b)
-                pp = pp + wp.cw_mul(w, aa + cc - two * bb)
-                qq = qq + wp.cw_mul(w, wp.cw_mul(a, c) + bb)
-                ss = ss + wp.cw_mul(w, aa + two * bb + cc)
-                pq = pq + wp.cw_mul(wb, a - c)
-                ps = ps + wp.cw_mul(w, aa - cc)
-                qs = qs + wp.cw_mul(wb, a + c)
-                middle = half * (a + c)
-                turned = half * (c - a)
-                along = along + wp.cw_mul(w, square(aa) + square(cc) - two * square(bb))
-                across = across + wp.cw_mul(
-                    w, square(square(middle + b)) + square(square(middle - b)) - two * square(square(turned))
-                )
-                round = round + wp.cw_mul(w, square(square(middle)))
-                mean_a = mean_a + wp.cw_mul(w, a)
-                mean_b = mean_b + wb
-                mean_c = mean_c + wp.cw_mul(w, c)
-            sums = product_sums(
-                wp.float64(two * lane_sum(pp)),
-                wp.float64(two * two * lane_sum(qq)),
-                wp.float64(two * lane_sum(ss)),
-                wp.float64(two * two * lane_sum(pq)),
-                wp.float64(two * lane_sum(ps)),
-                wp.float64(two * two * lane_sum(qs)),
-                wp.float64(lane_sum(along)),
-                wp.float64(lane_sum(across)),
-                wp.float64(lane_sum(round)),
+        if active == 0 and not of_ground:
+            for k in range(TERMS):
+                averages[k] = common[t, k]
+        else:
+            averages = average_over_baselines(
+                baseline,
+                packet_start[t],
+                packet_start[t + 1],
+                ground,
+                of_ground,
+                place[item],
+                active,
+                isotropic,
+                directed,
+                per_step,
             )
-            total = total + delay_weight[t] * sums
-            if terms.shape[2] > 3:
-                for k in range(9):
-                    terms[item, t, 3 + k] = delay_weight[t] * sums[k]
-            terms[item, t, 0] = wp.float64(lane_sum(mean_a))
-            terms[item, t, 1] = wp.float64(lane_sum(mean_b))
-            terms[item, t, 2] = wp.float64(lane_sum(mean_c))
-    for k in range(9):
-        squares[item, k] = total[k]
+        total = total + delay_weight[t] * averages
+        for k in range(terms.shape[2]):
+            terms[item, t, k] = averages[k]
+    for k in range(squares.shape[1]):
+        squares[item, k] = total[SLOPES + k]
+
+
+@wp.func
+def wick_products(slopes: wp.vec3d):
+    """Wick's products of covariances a, b, c of slopes."""
+    two = wp.float64(2.0)
+    four = wp.float64(4.0)
+    a = slopes[0]
+    b = slopes[1]
+    c = slopes[2]
+    return pair_products(
+        two * (a * a + c * c - two * b * b),
+        four * (a * c + b * b),
+        two * (a * a + two * b * b + c * c),
+        four * b * (a - c),
+        two * (a * a - c * c),
+        four * b * (a + c),
+    )
+
+
+@wp.kernel
+def products_with_mean_slope(
+    first: wp.int32,
+    slopes: wp.array2d(dtype=wp.vec3d),
+    width: wp.array(dtype=wp.float64),
+    start: wp.array(dtype=wp.int32),
+    part: wp.array(dtype=wp.float64),
+    exposure: wp.float64,
+    products: wp.array2d(dtype=wp.float64),
+):
+    """Average the products that the moments' covariances lose by the mean slope, for one lag.
+
+    Arguments: slopes [lag, delay]: covariances a, b, c of slopes a delay apart, which are overwritten by their sums
+    over delays; width [delay] of their intervals [s]; start, part [moment]: interval that holds the delay from the end
+    of the exposure to a moment, and the part of it before that; exposure [s]; products [lag, 6].
+    """
+    item = first + wp.tid()
+    count = width.shape[0] / 2
+    half = wp.float64(0.5)
+    total = wp.vec3d()
+    for t in range(2 * count):
+        total = total + width[t] * slopes[item, t]
+        slopes[item, t] = total
+    mean = wp.vec3d()
+    last = wp.vec3d()
+    average = pair_products()
+    for moment in range(count + 1):
+        before = wp.vec3d()
+        if start[moment] > 0:
+            before = before + slopes[item, start[moment] - 1]
+        before = before + part[moment] * (slopes[item, start[moment]] - before)
+        # Of a moment t with the mean slope: delays from t - T to t.
+        with_mean = (slopes[item, count + moment - 1] - before) / exposure
+        if moment > 0:
+            middle = half * (last + with_mean)
+            fraction = width[count + moment - 1] / exposure
+            average = average + fraction * wick_products(middle)
+            mean = mean + fraction * middle
+        last = with_mean
+    average = wp.float64(2.0) * average - wick_products(mean)
+    for k in range(6):
+        products[item, k] = average[k]

@@ -18,23 +18,36 @@ ring_values = wp.types.vector(MOST_RINGS, wp.float64)
 @wp.func
 def basis(
     radius: wp.array(dtype=wp.float64),
-    inverse: wp.array2d(dtype=wp.float64),
-    landed: wp.array2d(dtype=wp.float64),
-    star: wp.int32,
-    spoke: wp.int32,
-    n_spoke: wp.int32,
-    k: wp.int32,
+    landed: ring_values,
+    scale: ring_values,
     at: wp.float64,
 ):
-    """Value and slope at a radius of the polynomial that is 1 at ring ``k`` and 0 at the others whose rays landed."""
-    value = landed[star, k * n_spoke + spoke]
+    """Values and slopes at a radius of polynomials that are 1 at one ring and 0 at the others whose rays landed.
+
+    ``scale`` is one over the product of a ring's distances from these others, 0 where its own ray was lost.
+    """
+    n_ring = radius.shape[0]
+    values = ring_values()
+    slopes = ring_values()
+    # Products over the rings below, times those over the rings above.
+    product = wp.float64(1.0)
     slope = wp.float64(0.0)
-    for ring in range(radius.shape[0]):
-        if ring != k and landed[star, ring * n_spoke + spoke] > wp.float64(0.0):
-            factor = (at - radius[ring]) * inverse[k, ring]
-            slope = slope * factor + value * inverse[k, ring]
-            value = value * factor
-    return value, slope
+    for k in range(n_ring):
+        values[k] = product
+        slopes[k] = slope
+        if landed[k] > wp.float64(0.0):
+            slope = slope * (at - radius[k]) + product
+            product = product * (at - radius[k])
+    product = wp.float64(1.0)
+    slope = wp.float64(0.0)
+    for i in range(n_ring):
+        k = n_ring - 1 - i
+        slopes[k] = scale[k] * (slopes[k] * product + values[k] * slope)
+        values[k] = scale[k] * values[k] * product
+        if landed[k] > wp.float64(0.0):
+            slope = slope * (at - radius[k]) + product
+            product = product * (at - radius[k])
+    return values, slopes
 
 
 @wp.func
@@ -99,15 +112,21 @@ def place_points(
     start = edges[star, spoke, 0] * edges[star, spoke, 0]
     span = edges[star, spoke, 1] * edges[star, spoke, 1] - start
     landed_rays = zero
+    on_spoke = ring_values()
+    scale = ring_values()
     for ring in range(n_ring):
-        landed_rays = landed_rays + landed[star, ring * n_spoke + spoke]
+        on_spoke[ring] = landed[star, ring * n_spoke + spoke]
+        landed_rays = landed_rays + on_spoke[ring]
+    for k in range(n_ring):
+        scale[k] = on_spoke[k]
+        for ring in range(n_ring):
+            if ring != k and on_spoke[ring] > zero:
+                scale[k] = scale[k] * inverse[k, ring]
     clear = span > zero and landed_rays > zero
     # Direction cosines of the light at the image change along the spoke by this per metre.
     turn = -wp.transpose(wp.inverse(jacobian[star])) * unit[spoke]
     spoke_light = half * span * angle / area[star]
     swept = zero
-    values = ring_values()
-    slopes = ring_values()
     for ring in range(n_ring):
         point = ring * n_spoke + spoke
         light[star, point] = wp.float32(0.0)
@@ -127,16 +146,13 @@ def place_points(
             across = across * (half / (period * area[star]))
             if at > zero:
                 depth = wp.where(end == 0, -half, half) * area[star] / (at * angle)
-        for k in range(n_ring):
-            value, rate = basis(radius, inverse, landed, star, spoke, n_spoke, k, at)
-            values[k] = value
-            slopes[k] = rate
+        values, slopes = basis(radius, on_spoke, scale, at)
         steepness = cosines[star] + at * turn
         for wave in range(displacement.shape[1]):
             landing = jacobian[star] * dispersion[wave]
             slope = wp.vec2d(zero, zero)
             for k in range(n_ring):
-                if landed[star, k * n_spoke + spoke] > zero:
+                if on_spoke[k] > zero:
                     x = wp.float64(displacement[star, wave, k * n_spoke + spoke, 0])
                     y = wp.float64(displacement[star, wave, k * n_spoke + spoke, 1])
                     landing = landing + wp.vec2d(values[k] * x, values[k] * y)

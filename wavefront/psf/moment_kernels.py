@@ -17,13 +17,89 @@ weighted_sums = wp.types.vector(6, wp.float64)
 ELLIPSE = 6
 
 
-@wp.func
-def lane_total(values: samples):
-    """Sum over the lanes."""
-    total = wp.float32(0.0)
-    for i in range(LANES):
-        total = total + values[i]
-    return wp.float64(total)
+# In C with vectors of the compiler, which stay in the processor's registers. Factors of a row follow from those of the
+# row before.
+_ROW_LOOP = f"""
+    #pragma clang fp contract(fast)
+    typedef float packet __attribute__((vector_size({4 * LANES}), aligned(4)));
+    const packet kx = *(const packet*)&numbers;
+    const packet leaning = *(const packet*)&slant;
+    const packet zero = {{}};
+    const packet one = 1.0f - zero;
+    const int stride = spectrum.shape[2];
+    packet total = zero, x = zero, y = zero, square_x = zero, square_y = zero, product = zero;
+    for (int below = 0; below < 2; ++below) {{
+        const float sign = 1.0f - 2.0f * below;
+        const packet* re = (const packet*)spectrum.data + 2 * below * spectrum.shape[1] * stride + column;
+        const packet* im = re + spectrum.shape[1] * stride;
+        const packet* transfer = (const packet*)detector.data + below * detector.shape[1] * stride + column;
+        const packet tilt = below ? one / leaning : leaning;
+        const float turn = sign * turn_sine;
+        packet weight = *(const packet*)&along;
+        packet cosine = *(const packet*)&first_cosine;
+        packet sine = *(const packet*)&first_sine;
+        // Weight along y, and its ratio from one row to the next.
+        float fall = 1.0f, ratio = first_ratio;
+        for (int row = 0; row < n_row; ++row) {{
+            const float ky = sign * row;
+            const packet light = fall * weight * transfer[row * stride];
+            const packet even = light * (re[row * stride] * cosine - im[row * stride] * sine);
+            const packet odd = light * (re[row * stride] * sine + im[row * stride] * cosine);
+            // The weight's moments times the frequency.
+            const packet moved_x = xx * kx + xy * ky;
+            const packet moved_y = xy * kx + yy * ky;
+            total += even;
+            x -= odd * moved_x;
+            y -= odd * moved_y;
+            square_x += even * (xx - moved_x * moved_x);
+            square_y += even * (yy - moved_y * moved_y);
+            product += even * (xy - moved_x * moved_y);
+            weight *= tilt;
+            fall *= ratio;
+            ratio *= first_ratio * first_ratio;
+            const packet turned = turn_cosine * cosine - turn * sine;
+            sine = turn_cosine * sine + turn * cosine;
+            cosine = turned;
+        }}
+    }}
+    wp::vec_t<6, wp::float64> sums;
+    for (int i = 0; i < {LANES}; ++i) {{
+        sums.c[0] += total[i];
+        sums.c[1] += x[i];
+        sums.c[2] += y[i];
+        sums.c[3] += square_x[i];
+        sums.c[4] += square_y[i];
+        sums.c[5] += product[i];
+    }}
+    return sums;
+"""
+
+
+@wp.func_native(_ROW_LOOP)
+def sum_rows(
+    spectrum: wp.array3d(dtype=samples),
+    detector: wp.array3d(dtype=samples),
+    column: wp.int32,
+    n_row: wp.int32,
+    numbers: samples,
+    along: samples,
+    slant: samples,
+    first_cosine: samples,
+    first_sine: samples,
+    turn_cosine: wp.float32,
+    turn_sine: wp.float32,
+    first_ratio: wp.float32,
+    xx: wp.float32,
+    yy: wp.float32,
+    xy: wp.float32,
+) -> weighted_sums:
+    """Weighted sums over the rows of a packet of columns, contiguous spectrum [4, row, packet] times detector.
+
+    Arguments: numbers of the columns; along: weight in row 0, and slant: its factor from one row to the next, but for
+    what depends on the row alone, whose ratio from row 0 to row 1 is first_ratio; cosines and sines of the centre in
+    row 0, and of its turn from one row to the next; moments xx, yy, xy of the weight.
+    """
+    ...
 
 
 @wp.func
@@ -38,66 +114,35 @@ def weighted_moments(
     yy: wp.float32,
     xy: wp.float32,
 ):
-    """Weighted sums about a centre, in radians a step of frequency, under a weight of moments xx, yy, xy.
-
-    Factors of a row follow from those of the row before.
-    """
+    """Weighted sums about a centre, in radians a step of frequency, under a weight of moments xx, yy, xy."""
     half = wp.float32(0.5)
-    turn_c = wp.cos(center_y)
-    turn_s = wp.sin(center_y)
-    zeroth = samples()
-    first_x = samples()
-    first_y = samples()
-    second_xx = samples()
-    second_yy = samples()
-    second_xy = samples()
+    sums = weighted_sums()
     for packet in range(rows.shape[0]):
         kx = lane_numbers(packet)
         along = samples()
         slant = samples()
-        slant_back = samples()
         for i in range(LANES):
             along[i] = wp.exp(-half * xx * kx[i] * kx[i])
             slant[i] = wp.exp(-xy * kx[i])
-            slant_back[i] = wp.exp(xy * kx[i])
-        start_c, start_s = unit_circle((center_x / wp.float32(wp.TAU)) * kx)
-        for below in range(2):
-            sign = wp.float32(1 - 2 * below)
-            turn = turn_s * sign
-            tilt = slant
-            if below == 1:
-                tilt = slant_back
-            weight = along
-            cosine = start_c
-            sine = start_s
-            for row in range(rows[packet]):
-                ky = sign * wp.float32(row)
-                light = wp.exp(-half * yy * ky * ky) * wp.cw_mul(weight, detector[below, row, packet])
-                re = spectrum[star, 2 * below, row, packet]
-                im = spectrum[star, 2 * below + 1, row, packet]
-                even = wp.cw_mul(light, wp.cw_mul(re, cosine) - wp.cw_mul(im, sine))
-                odd = wp.cw_mul(light, wp.cw_mul(re, sine) + wp.cw_mul(im, cosine))
-                # The weight's moments times the frequency.
-                moved_x = xx * kx + samples(xy * ky)
-                moved_y = xy * kx + samples(yy * ky)
-                zeroth = zeroth + even
-                first_x = first_x - wp.cw_mul(odd, moved_x)
-                first_y = first_y - wp.cw_mul(odd, moved_y)
-                second_xx = second_xx + wp.cw_mul(even, samples(xx) - wp.cw_mul(moved_x, moved_x))
-                second_yy = second_yy + wp.cw_mul(even, samples(yy) - wp.cw_mul(moved_y, moved_y))
-                second_xy = second_xy + wp.cw_mul(even, samples(xy) - wp.cw_mul(moved_x, moved_y))
-                weight = wp.cw_mul(weight, tilt)
-                turned = turn_c * cosine - turn * sine
-                sine = turn_c * sine + turn * cosine
-                cosine = turned
-    return weighted_sums(
-        lane_total(zeroth),
-        lane_total(first_x),
-        lane_total(first_y),
-        lane_total(second_xx),
-        lane_total(second_yy),
-        lane_total(second_xy),
-    )
+        cosine, sine = unit_circle((center_x / wp.float32(wp.TAU)) * kx)
+        sums = sums + sum_rows(
+            spectrum[star],
+            detector,
+            packet,
+            rows[packet],
+            kx,
+            along,
+            slant,
+            cosine,
+            sine,
+            wp.cos(center_y),
+            wp.sin(center_y),
+            wp.exp(-half * yy),
+            xx,
+            yy,
+            xy,
+        )
+    return sums
 
 
 @wp.kernel

@@ -42,23 +42,50 @@ def test_spectra_of_moments_have_the_covariances():
             assert got == pytest.approx(theory[:, i, j], abs=0.016 * math.sqrt(changing[i] * changing[j]))
 
 
+def test_modes_are_those_of_white_noise():
+    """600 grids of 8 x 8: unit variance, and one power at all frequencies, also those whose opposite is themselves.
+
+    Five standard errors of a mean of squares: 0.29 of two that are real, 0.2 of others.
+    """
+    random = np.random.default_rng(5)
+    noise = np.array([np.fft.irfft2(exposure_fields._white_modes(random, 8, 5, 8), s=(8, 8)) for _ in range(600)])
+    power = (np.abs(np.fft.fft2(noise)) ** 2).mean(axis=0) / 64
+    assert power == pytest.approx(np.ones((8, 8)), abs=0.3)
+    assert (noise**2).mean() == pytest.approx(1.0, abs=5 * math.sqrt(2.0 / noise.size))
+    # No mode is another one's copy, but for the conjugate of its opposite.
+    spectra = np.fft.rfft2(noise).reshape(600, -1)[:, 1:]
+    correlation = np.abs(spectra.T @ spectra.conj()) / 600 / 64
+    opposite = [(8 - row) % 8 * 5 + column - 1 for row in range(8) for column in range(5)][1:]
+    for k, other in enumerate(opposite):
+        column = (k + 1) % 5
+        correlation[k, [k, other] if column in (0, 4) else [k]] = 0.0
+    assert correlation.max() < 0.25
+
+
 @pytest.mark.long
-def test_mean_wavefronts_have_their_covariances():
-    """Of one high layer, whose field holds many independent pupils, against the quadrature of another module."""
-    air = AIR._replace(altitudes=(15_000.0,), weights=(1.0,), velocities=((-4.0, 9.0),))
-    grid = FieldGrid(512, 0.05)
+@pytest.mark.parametrize(
+    ("altitudes", "side"), [((15_000.0,), 0.05), pytest.param((12_000.0, 4000.0), 0.1, id="low layer, few modes")]
+)
+def test_mean_wavefronts_have_their_covariances(altitudes, side):
+    """Of one layer, whose field holds many independent pupils, against the quadrature of another module."""
+    altitude = min(altitudes)
+    weights = tuple(float(a == altitude) for a in altitudes)
+    air = AIR._replace(altitudes=altitudes, weights=weights, velocities=((-4.0, 9.0),) * len(altitudes))
+    grid = FieldGrid(512, side)
     ground, fields = exposure_fields._draw_wavefronts(air, grid, 3, 0)
     assert not ground.any()
     drawn = ExposureFields(np.zeros(3), fields[0], ground, fields)
-    stars = np.random.default_rng(1).uniform(0, 0.05, (20_000, 2))
-    lag = np.array([3.0, 1.0]) / 15_000.0
+    stars = np.random.default_rng(1).uniform(0, side, (20_000, 2))
+    lag = np.array([3.0, 1.0]) / altitude
     here, there = drawn.wavefronts_at(stars), drawn.wavefronts_at(stars + lag)
     theory = mean_wavefront_covariance(air, [(0.0, 0.0), lag], NOLL, air.diameter, air.obscuration)
     sigma = np.sqrt(np.diag(theory[0, :, 0]))
     scale = np.outer(sigma, sigma)
-    # 750 m of a layer, 8 m across and 50 m along the wind for each independent patch: some 1400, three standard errors.
-    assert here.T @ here / len(stars) / scale == pytest.approx(theory[0, :, 0] / scale, abs=0.12)
-    assert here.T @ there / len(stars) / scale == pytest.approx(theory[0, :, 1] / scale, abs=0.12)
+    # 750 m of a layer, 8 m across and 50 m along the wind for each independent patch: some 1400, three standard errors;
+    # of the low one 400 m. Z11 lacks a seventh of its variance.
+    bound = 0.12 * 750.0 / (side * altitude)
+    assert here.T @ here / len(stars) / scale == pytest.approx(theory[0, :, 0] / scale, abs=bound)
+    assert here.T @ there / len(stars) / scale == pytest.approx(theory[0, :, 1] / scale, abs=bound)
 
 
 def test_ground_layer_is_the_same_for_all_stars():
