@@ -79,7 +79,7 @@ class Channels:
         return moved
 
     def path(self, optics: PupilOptics) -> np.ndarray:
-        """Return paths to spheres through the exit pupil [m] that belong to the displacement, [n_star, n_channel, n_pupil]."""
+        """Return :attr:`PupilOptics.exit_pupil_path` [m] of the displacements, [n_star, n_channel, n_pupil]."""
         if not self.shift.any():
             return optics.exit_pupil_path
         square = (optics.exit_cosines**2).sum(axis=-1) - (optics.reference_cosines**2).sum(axis=-1)[:, None]
