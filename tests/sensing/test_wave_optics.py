@@ -104,7 +104,7 @@ def test_donuts_of_a_small_telescope_fit_what_they_are_drawn_with(known):
     model = pachon.DonutModel(air=air if known else pachon.DonutAir(), detector=detector, diffraction=True)
     fit = pachon.fit_donuts(focused, 1e7 * drawn.psf.image, [(0.0, 0.0)], sky_variance=500.0, model=model, threads=1)
     assert fit.usable.all()
-    # 50 nm where the donut had another scale than its rays; 5 nm are what cells, and a last step that is not made, leave.
+    # 50 nm where the donut had another scale than its rays; cells, and a last step that is not made, leave 5 nm.
     assert np.linalg.norm(fit.zernikes[0]) < 8e-9
     assert np.linalg.norm(fit.zernikes[0]) < np.sqrt(np.trace(fit.covariance[0]))
     assert fit.fwhm[0] == pytest.approx(air.fwhm, rel=0.05)

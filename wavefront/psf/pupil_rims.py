@@ -21,7 +21,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -36,10 +35,16 @@ from .clear_pupil import clear_edges
 PIECES = 192
 # Curvature of a rim, over that of the pupil's own, up to which it is no corner.
 _MOST_CURVED = 5.0
-# Lean of a strip [rad] below which its mean is a parabola.
-_STRAIGHT = 0.05
+# Coefficients of the series of the sinc by the square of the lean of strips, and leans [rad] up to which so many of
+# them are the sinc to 1e-4.
+_SINC = tuple(np.float32(1.0 / v) for v in (-6.0, 120.0, -5040.0, 362880.0))
+_SERIES = (0.3, 0.85, 1.6, 2.4)
+# Lean of a strip [rad] below which the sinc is a parabola.
+_SMALL_LEAN = 0.05
+# Width of strips over the radius of the pupil up to which the rim is straight along them and all wavefronts lean alike.
+_NARROW = 0.05
 # Frequencies at a time: their strips stay in the processor's cache.
-_CHUNK = 256
+_CHUNK = 128
 
 
 @dataclass(frozen=True)
@@ -92,7 +97,7 @@ class PupilRims:
         """
         out = np.empty(len(wave), dtype=np.complex64)
         for strips in self._strips(baseline, wave, landing, inward):
-            light = strips.light * strips.mean
+            light = strips.light * strips.mean()
             out[strips.piece].real = np.einsum("fn,fn->f", light, np.cos(strips.phase))
             out[strips.piece].imag = -np.einsum("fn,fn->f", light, np.sin(strips.phase))
         return out
@@ -114,17 +119,19 @@ class PupilRims:
         values, out = (np.empty((len(wave), *shape), dtype=np.complex64) for shape in ((), response.shape[2:]))
         moved, leant = response.astype(np.float32), inward_response.astype(np.float32)
         for strips in self._strips(baseline, wave, landing, inward):
-            piece, k, light = strips.piece, strips.wave, strips.light
-            cosine, sine = np.cos(strips.phase), np.sin(strips.phase)
-            mean, change = light * strips.mean, light * strips.half_width * strips.mean_slope
-            values[piece].real, values[piece].imag = (mean * cosine).sum(axis=1), -(mean * sine).sum(axis=1)
-            # By the place of the strip, and by what its phase changes across it.
-            by_place = -mean * sine, -mean * cosine
-            leaning = mean * strips.half_width
-            by_lean = change * cosine - leaning * sine, -change * sine - leaning * cosine
-            out[piece].real, out[piece].imag = (
-                sum(k[:, i, None] * (place @ moved[i] + lean @ leant[i]) for i in (0, 1))
-                for place, lean in zip(by_place, by_lean, strict=True)
+            light, cosine, sine = strips.light * strips.mean(), np.cos(strips.phase), np.sin(strips.phase)
+            real, imaginary = light * cosine, -light * sine
+            values[strips.piece].real, values[strips.piece].imag = real.sum(axis=1), imaginary.sum(axis=1)
+            slopes = [(imaginary @ v, -(real @ v)) for v in moved]
+            if strips.wide:
+                # What the phase changes across a strip goes with that of its middle, and changes the mean.
+                half, change = 0.5 * strips.width, 0.5 * strips.width * strips.light * strips.mean_slope()
+                by_lean = half * imaginary + change * cosine, -half * real - change * sine
+                for along, v in zip(slopes, leant, strict=True):
+                    for slope, lean in zip(along, by_lean, strict=True):
+                        slope += lean @ v
+            out[strips.piece].real, out[strips.piece].imag = (
+                sum(strips.wave[:, i, None] * slopes[i][part] for i in (0, 1)) for part in (0, 1)
             )
         return values, out
 
@@ -132,16 +139,26 @@ class PupilRims:
         self, baseline: np.ndarray, wave: np.ndarray, landing: np.ndarray, inward: np.ndarray
     ) -> Iterator[_Strips]:
         """Yield the strips at some frequencies after the other."""
-        across, places, steps = (v.T.astype(np.float32) for v in (self.normals, landing, inward))
-        parts, curvatures = self.parts.astype(np.float32), self.curvatures.astype(np.float32)
+        across, places, steps = (v.T.astype(np.float32) for v in (0.5 * self.normals, landing, 0.5 * inward))
+        straight, bent = (v.astype(np.float32) for v in (-self.parts, self.parts * self.curvatures))
+        narrow = _NARROW * float(np.abs(self.points).max(initial=0.0))
+        steepest = math.sqrt(float((steps**2).sum(axis=0).max(initial=0.0)))
         for first in range(0, len(wave), _CHUNK):
             piece = slice(first, first + _CHUNK)
             b, k = (v[piece].astype(np.float32) for v in (baseline, wave))
-            half = np.float32(0.25) * np.abs(b @ across)
-            lean = half * (k @ steps)
-            eighth = np.float32(0.125) * (b * b).sum(axis=1, keepdims=True)
-            light = -parts * (2.0 * half + curvatures * (eighth - 4.0 * half * half))
-            yield _Strips(piece, k, light, half, lean, k @ places + lean)
+            width = b @ across
+            np.abs(width, out=width)
+            lean = k @ steps
+            lean *= width
+            square = (b * b).sum(axis=1)
+            widest = 0.5 * math.sqrt(float(square.max()))
+            most = widest * math.sqrt(float((k * k).sum(axis=1).max())) * steepest
+            wide, light = widest > narrow, straight * width
+            if wide:
+                light += bent * width * width - np.outer(np.float32(0.125) * square, bent)
+            phase = k @ places
+            phase += lean
+            yield _Strips(piece, k, light, width, lean, phase, most, wide)
 
 
 @dataclass(frozen=True)
@@ -156,28 +173,41 @@ class _Strips:
         Their wave vectors [rad/m].
     light : ndarray, shape [n_frequency, n]
         Fractions of the light in the strips, negative.
-    half_width, lean, phase : ndarray, shape [n_frequency, n]
-        Half of the widths of the strips [m], phase of their middles against the rim, and phase there [rad].
+    width, lean, phase : ndarray, shape [n_frequency, n]
+        Widths of the strips [m], phase of their middles against the rim, and phase there [rad].
+    most : float
+        A bound of the lean [rad].
+    wide : bool
+        Whether strips are so wide that the curvature of the rim, and changes of the lean, matter.
     """
 
     piece: slice
     wave: np.ndarray
     light: np.ndarray
-    half_width: np.ndarray
+    width: np.ndarray
     lean: np.ndarray
     phase: np.ndarray
+    most: float
+    wide: bool
 
-    @cached_property
     def mean(self) -> np.ndarray:
-        """Means of the wave over the strips, over those at their middles."""
-        return np.sinc(self.lean / np.float32(math.pi))
+        """Means of the waves over the strips, over those at their middles."""
+        terms = next((n for n, most in enumerate(_SERIES, 1) if self.most < most), 0)
+        if not terms:
+            return np.sinc(self.lean / np.float32(math.pi))
+        square = self.lean * self.lean
+        mean = square * _SINC[terms - 1]
+        for coefficient in _SINC[: terms - 1][::-1]:
+            mean += coefficient
+            mean *= square
+        mean += np.float32(1.0)
+        return mean
 
-    @property
     def mean_slope(self) -> np.ndarray:
         """Derivatives of these by the lean."""
-        lean = np.where(np.abs(self.lean) < _STRAIGHT, np.float32(_STRAIGHT), self.lean)
-        slope = (np.cos(lean) - np.sinc(lean / np.float32(math.pi))) / lean
-        return np.where(np.abs(self.lean) < _STRAIGHT, -self.lean / np.float32(3.0), slope)
+        small = np.abs(self.lean) < _SMALL_LEAN
+        lean = np.where(small, np.float32(1.0), self.lean)
+        return np.where(small, self.lean / np.float32(-3.0), (np.cos(lean) - np.sin(lean) / lean) / lean)
 
 
 def strip_overlap(baseline: np.ndarray, diameter: float, obscuration: float) -> np.ndarray:
