@@ -322,16 +322,18 @@ class RimsOfCells:
 
     def __init__(self, cells: PupilCells, response: np.ndarray | None = None) -> None:
         self._cells, self._response = cells, response
-        self._last: tuple[PupilRims, np.ndarray] | None = None
+        self._last: tuple[PupilRims, np.ndarray, np.ndarray] | None = None
 
     def at(self, rims: PupilRims, landing: np.ndarray, *, responding: bool = True) -> RimsAt:
         """Return rims at the middle wavelength for landing points of the cells [m], shape [n, 2]."""
         smooth = self._cells.smooth
         if self._response is None or not responding:
-            return RimsAt(*rims.landing(smooth, self._middle(landing)), np.zeros((2, len(rims.points), 0)))
+            none = np.zeros((2, len(rims.points), 0))
+            return RimsAt(*rims.landing(smooth, self._middle(landing)), none, none)
         if self._last is None or self._last[0] is not rims:
-            self._last = rims, np.stack([smooth.at(rims.points, self._middle(axis))[0] for axis in self._response])
-        return RimsAt(*rims.landing(smooth, self._middle(landing)), self._last[1])
+            axes = [rims.landing(smooth, self._middle(axis)) for axis in self._response]
+            self._last = rims, *(np.stack(v) for v in zip(*axes, strict=True))
+        return RimsAt(*rims.landing(smooth, self._middle(landing)), *self._last[1:])
 
     def _middle(self, values: np.ndarray) -> np.ndarray:
         """Return values of all wavelengths at the middle one."""

@@ -132,7 +132,8 @@ class ExposureDonuts(WavefrontFit):
         variance = min(exposure.air_rms, _MOST_AIR) ** 2 * variance[further - 4]
         variance[: len(terms.further)] += 1.0 / terms.precision[len(terms.requested) :]
         precision = np.concatenate([np.zeros(len(terms.requested)), 1.0 / variance])
-        return WavefrontTerms(terms.requested, further, precision, terms.air)
+        figure = np.concatenate([terms.figure, np.zeros(len(precision) - len(terms.figure))])
+        return WavefrontTerms(terms.requested, further, precision, figure, terms.air)
 
     def sided(self, instrument: Instrument, stars: Sequence[StarFit], fields: np.ndarray) -> list[StarFit]:
         """Return the stars with flags by the side of focus that all of them together say."""

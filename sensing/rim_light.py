@@ -34,13 +34,14 @@ class RimsAt:
         Landing points from that of the chief ray [m].
     inward : ndarray, shape [n_rim, 2]
         Their change per metre of the pupil towards the lit side.
-    response : ndarray, shape [2, n_rim, n_wave]
-        Derivatives of the landing points with respect to the unknowns of the wavefront [m].
+    response, inward_response : ndarray, shape [2, n_rim, n_wave]
+        Derivatives of both with respect to the unknowns of the wavefront.
     """
 
     landing: np.ndarray
     inward: np.ndarray
     response: np.ndarray
+    inward_response: np.ndarray
 
 
 class RimLight:
@@ -106,7 +107,7 @@ class RimLight:
             slopes = np.zeros((len(wave), count), dtype=np.complex64)
             if count:
                 values[bright], slopes[bright] = self.rims.transfer_slopes(
-                    baseline[bright], wave[bright], *places, at.response
+                    baseline[bright], wave[bright], *places, at.response, at.inward_response
                 )
             dim = ~bright if count else np.ones(len(wave), dtype=bool)
             values[dim] = self.rims.transfer(baseline[dim], wave[dim], *places)

@@ -90,7 +90,8 @@ class StarErrors:
     of_light : ndarray, shape [n_noll, n_noll]
         Covariance of the wavefront of its light, the air's low terms among it, but for what stars have in common.
     figure : ndarray, shape [n_noll, n_noll]
-        What stars have in common: terms of the telescope that are not fitted.
+        What stars have in common: the telescope's terms beside those asked for, fitted with a prior or not, and the
+        accuracy of the model.
     """
 
     covariance: np.ndarray
@@ -106,7 +107,8 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     solution, terms = star.solution, instrument.terms
     n_star, n = len(solution.stars[0]), len(terms.requested)
     wavefront = slice(n_star, n_star + n)
-    photons, air, figure, speckled = solution.covariance, terms.air, np.zeros((n, n)), np.zeros((n, n))
+    photons, air = solution.covariance, terms.air
+    figure, by_prior, speckled = np.zeros((3, n, n))
     residuals, lacking = np.zeros_like(photons), solution.star_covariance(0).copy()
     point = linearized(star.stamp, solution.stars[0], solution.waves[0])
     if point is not None and len(solution.shared):
@@ -124,6 +126,9 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
         residuals = power.covariance
         lacking += residuals[:n_star, :n_star]
         figure = beside.figure(photons)[wavefront, wavefront]
+        # What a prior about zero takes from the telescope's further terms goes into those asked for.
+        pulled = photons[wavefront, n_star : n_star + len(terms.figure)] * terms.precision * np.sqrt(terms.figure)
+        by_prior = pulled @ pulled.T
         known_air = instrument.model.air.atmosphere is not None
         strength = 0.0 if known_air else min(power.strength, _most_air(instrument, float(solution.stars[0][STRENGTH])))
         if strength > 0.0:
@@ -132,7 +137,8 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
             speckled = speckles[wavefront, wavefront]
     accuracy, of_residuals = model_floor(solution.shared[:n]), residuals[wavefront, wavefront] + by_rivals(star, n)
     parts = ErrorParts.of(photons[wavefront, wavefront], of_residuals, air, figure + accuracy)
-    return StarErrors(lacking, parts, parts.photons + parts.residuals + speckled + accuracy, figure)
+    of_light = parts.photons - by_prior + parts.residuals + speckled
+    return StarErrors(lacking, parts, of_light, figure + by_prior + accuracy)
 
 
 def by_rivals(star: StarSolution, n: int) -> np.ndarray:

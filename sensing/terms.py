@@ -33,6 +33,8 @@ class WavefrontTerms:
         Noll indices of the terms that are fitted beside them.
     precision : ndarray, shape [n + m]
         Inverse variances of Gaussian priors about zero [1/m^2]; 0 for the terms asked for.
+    figure : ndarray, shape [n + m]
+        Variances of the telescope's part of these priors [m^2], which all stars have in common; the rest is the air's.
     air : ndarray, shape [n, n]
         Covariance of the terms asked for in the mean wavefront of the air [m^2].
     higher_order : float
@@ -42,6 +44,7 @@ class WavefrontTerms:
     requested: np.ndarray
     further: np.ndarray
     precision: np.ndarray
+    figure: np.ndarray
     air: np.ndarray
     higher_order: float = 0.0
 
@@ -56,6 +59,7 @@ class WavefrontTerms:
     ) -> WavefrontTerms:
         """Return the terms beside those asked for by the rms of each [m], and by the turbulence of the exposure."""
         further, variance = further_terms(requested, left_out, higher_order)
+        figure = np.concatenate([np.zeros(len(requested)), variance])
         added = np.zeros((len(requested), len(requested)))
         if air is not None and telescope is not None:
             noll = np.arange(4, max(_AIR_TERMS, int(requested.max()), int(further.max(initial=4))) + 1)
@@ -65,9 +69,10 @@ class WavefrontTerms:
             beyond = np.setdiff1d(noll, np.concatenate([requested, further]))
             variance = np.concatenate([variance, np.zeros(len(beyond))])
             further = np.concatenate([further, beyond])
+            figure = np.concatenate([figure, np.zeros(len(beyond))])
             variance = variance + np.diag(covariance)[further - 4]
         precision = np.concatenate([np.zeros(len(requested)), 1.0 / variance])
-        return cls(requested, further, precision, added, higher_order)
+        return cls(requested, further, precision, figure, added, higher_order)
 
     @property
     def every(self) -> np.ndarray:

@@ -24,13 +24,22 @@ from ..raytrace.pack.surfaces import indices_and_wavelength, pack_surfaces
 from ..raytrace.rays import Projection, RayStatus, require_distant_object
 from ..raytrace.trace import trace
 from .aberration import ResidualWavefront
-from .chief_rays import image_jacobians, reference_rays
+from .chief_rays import chief_ray_derivatives, reference_rays
 from .pupil_sampling import CHIEF_RAY
 from .reference_sphere import path_to_sphere
 from .request import Request
 
 # Attributes of each star.
-_OF_STARS = ("displacement", "path", "lit", "jacobian", "reference_points", "reference_cosines", "fields")
+_OF_STARS = (
+    "displacement",
+    "path",
+    "lit",
+    "jacobian",
+    "exit_jacobian",
+    "reference_points",
+    "reference_cosines",
+    "fields",
+)
 
 
 @dataclass(frozen=True)
@@ -48,6 +57,9 @@ class PupilOptics:
     path: np.ndarray
     lit: np.ndarray  #: [n_star, n_wave, n_pupil] bool
     jacobian: np.ndarray  #: [n_star, 2, 2] m/rad: detector position by direction cosines of the incoming light
+    #: [n_star, 2, 2]: direction cosines of chief rays at the image, times the index there, by those of incoming light
+    exit_jacobian: np.ndarray
+    sphere_curvature: float  #: of the reference spheres, times that index [1/m]
     reference_points: np.ndarray  #: [n_star, 3] m, telescope frame
     reference_cosines: np.ndarray  #: [n_star, 2] direction cosines of the chief rays along x and y of the detector
     fields: np.ndarray  #: [n_star, 2] rad
@@ -66,6 +78,19 @@ class PupilOptics:
         """Return the optics of the stars of all parts, of one pupil and the same wavelengths."""
         arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _OF_STARS}
         return replace(parts[0], **arrays)
+
+    @property
+    def exit_pupil_path(self) -> np.ndarray:
+        """Path to spheres through the exit pupil minus that of the chief ray [m], shape of `path`.
+
+        Its gradient along the pupil is the inverse of the Jacobian times the displacement, out of focus too: waves of
+        this phase land where rays do. On another sphere the image has another scale, in proportion to the defocus.
+        """
+        # Curvature of the reference sphere beyond that of the sphere through the exit pupil.
+        excess = self.exit_jacobian @ np.linalg.inv(self.jacobian) + self.sphere_curvature * np.eye(2)
+        landing = self.displacement.astype(np.float64)
+        squares = np.einsum("swpi,sij,swpj->swp", landing, excess, landing)
+        return np.asarray(self.path + 0.5 * squares)
 
     @property
     def exit_cosines(self) -> np.ndarray:
@@ -129,7 +154,8 @@ def trace_pupils(
         chief_path[:, w] = path_to_sphere(end.path_length, index, end.position, end.direction, reference_points, radius)
 
     packed, count = pack_surfaces(telescope), packet_count(n_pupil)
-    planes = np.concatenate([reference_points, normal], axis=1)
+    axes = np.tile(rotation[:, :2].T.ravel(), (n_star, 1))
+    planes = np.concatenate([reference_points, normal, axes], axis=1)
 
     def traced(stars: slice, waves: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
         """Trace the same points [m] for some stars and wavelengths, by index: x, y, path and status."""
@@ -170,11 +196,9 @@ def trace_pupils(
             for k in range(4)
         )
     offset = np.stack([x, y], axis=-1)
-    if not np.array_equal(rotation, np.eye(3)):
-        # The detector's own x and y; the third component, along its normal, is the tilt of a CCD times micrometres.
-        offset = offset @ rotation[:2, :2]
     path = traced_path - chief_path[:, :, None]
-    jacobian = image_jacobians(telescope, direction, request.middle, threads)
+    index = float(light[request.middle_index, -3])
+    jacobian, turn = chief_ray_derivatives(telescope, direction, request.middle, threads)
     if aberration is not None:
         # The path is minus the OPD; light is displaced by the Jacobian times the gradient of the path, as by a screen.
         x, y = pupil.T
@@ -189,6 +213,8 @@ def trace_pupils(
         path=path,
         lit=status == RayStatus.OK,
         jacobian=jacobian,
+        exit_jacobian=index * turn,
+        sphere_curvature=index / radius,
         reference_points=reference_points,
         reference_cosines=(chief.direction @ rotation)[:, :2],
         fields=request.fields,

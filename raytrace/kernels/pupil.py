@@ -64,9 +64,10 @@ def trace_pupils(special: bool, module: wp.Module) -> wp.Kernel:
     ):
         """Trace packet ``item % n_packets`` of the pupil for bundle ``item // n_packets``.
 
-        A bundle is one star at one wavelength. ``reference`` holds, per bundle, a point of the CCD surface and its
-        normal (-dh/dx, -dh/dy, 1) before normalisation [6]. Written: the intersections with the tangent plane of the
-        CCD there, relative to the point, and the optical paths to the sphere of that radius about the point, beyond it.
+        A bundle is one star at one wavelength. ``reference`` holds, per bundle, a point of the CCD surface, its normal
+        (-dh/dx, -dh/dy, 1) before normalisation, and the detector's x and y axes [12]. Written: the intersections with
+        the tangent plane of the CCD there, relative to the point, along these axes, and the optical paths to the sphere
+        of that radius about the point, beyond it.
         """
         item = first + wp.tid()
         b = item / n_packets
@@ -87,8 +88,11 @@ def trace_pupils(special: bool, module: wp.Module) -> wp.Kernel:
         ny = reference[b, 4]
         nz = reference[b, 5]
         along = wp.cw_div(nx * x + ny * y + nz * z, nx * u + ny * v + nz * w)
-        displacement_x[b, p] = x - wp.cw_mul(along, u)
-        displacement_y[b, p] = y - wp.cw_mul(along, v)
+        on_x = x - wp.cw_mul(along, u)
+        on_y = y - wp.cw_mul(along, v)
+        on_z = z - wp.cw_mul(along, w)
+        displacement_x[b, p] = reference[b, 6] * on_x + reference[b, 7] * on_y + reference[b, 8] * on_z
+        displacement_y[b, p] = reference[b, 9] * on_x + reference[b, 10] * on_y + reference[b, 11] * on_z
         ahead, _along, _root = sphere_distance(x, y, z, u, v, w, radius)
         path_out[b, p] = path + indices[row, n_surfaces - 1] * ahead
         status_out[b, p] = statuses(status)

@@ -1,5 +1,7 @@
 """Donuts of an exposure fitted together: pairs on both sides of focus, and the side of focus, on brute-force images."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from donut_images import PIXEL, WAVELENGTH, donut, noisy
@@ -114,3 +116,22 @@ def test_a_rim_that_the_others_contradict_is_of_one_donut(focused, true):
     assert good.sum() >= 3
     # With M1's rim free for all they were wrong by 500 nm, most of it Z4.
     assert rss(fit.zernikes - (after - before))[good].max() < 150e-9
+
+
+@pytest.mark.slow
+def test_errors_that_all_donuts_have_in_common_do_not_average(true):
+    """The model's accuracy, and what a prior takes from the telescope's further terms, are as large for four donuts."""
+    behind = true.perturbed("Detector", shift=(0.0, 0.0, DEFOCUS))
+    fields = np.deg2rad([(0.9, 0.7)]) + 1e-3 * np.array([(i, j) for i in range(2) for j in range(2)])
+    # So bright that photons leave little.
+    images = [donut(behind, field, flux=3e8) for field in fields]
+    spread, options = 10e-9, {**OPTIONS, "model": replace(of_sides(*np.ones(4)), n_pupil=60, diffraction=False)}
+    alone, together = (
+        pachon.fit_donuts(true, images, fields, WAVELENGTH, fit=fit, **options)
+        for fit in (
+            pachon.sensing.SingleDonuts(higher_order=spread),
+            pachon.sensing.ExposureDonuts(higher_order=spread),
+        )
+    )
+    least = np.array([part.diagonal() for part in alone.error_parts.floor])
+    assert (np.diagonal(together.covariance, axis1=1, axis2=2) > 0.99 * least).all()

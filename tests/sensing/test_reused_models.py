@@ -160,7 +160,7 @@ def test_light_next_to_the_cells_lands_where_rays_say(behind_focus):
 
 @pytest.mark.long
 def test_a_fit_with_diffraction_that_begins_with_rays_is_one_from_the_start(focused):
-    telescope, field = focused.perturbed("Camera", shift=(0.0, 0.0, 1.5e-3)), np.deg2rad([[0.5, 0.3]])
+    telescope, field = focused.perturbed("Camera", shift=(0.0, 0.0, 1.5e-3)), np.deg2rad([[1.0, 0.7]])
     true = telescope.perturbed("M2", shift=(1e-4, 0.0, 0.0))
     model = pachon.DonutModel(
         air=pachon.DonutAir(fwhm=np.deg2rad(0.6 / 3600)), detector=pachon.DonutDetector(PIXEL), diffraction=True

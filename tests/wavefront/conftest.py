@@ -88,6 +88,8 @@ class PolynomialPupil:
             path=same(path),
             lit=np.broadcast_to(lit, (len(fields), len(wavelengths), len(x))).copy(),
             jacobian=np.broadcast_to(jacobian, (len(fields), 2, 2)).copy(),
+            exit_jacobian=np.zeros((len(fields), 2, 2)),
+            sphere_curvature=0.0,
             reference_points=np.zeros((len(fields), 3)),
             reference_cosines=np.tile(self.cosines, (len(fields), 1)),
             fields=fields,

@@ -79,11 +79,11 @@ class Channels:
         return moved
 
     def path(self, optics: PupilOptics) -> np.ndarray:
-        """Return paths to the reference spheres [m] that belong to the displacement, [n_star, n_channel, n_pupil]."""
+        """Return :attr:`PupilOptics.exit_pupil_path` [m] of the displacements, [n_star, n_channel, n_pupil]."""
         if not self.shift.any():
-            return optics.path
+            return optics.exit_pupil_path
         square = (optics.exit_cosines**2).sum(axis=-1) - (optics.reference_cosines**2).sum(axis=-1)[:, None]
-        return np.asarray(optics.path[:, self.wave] - 0.5 * self.shift[:, None] * square[:, None])
+        return np.asarray(optics.exit_pupil_path[:, self.wave] - 0.5 * self.shift[:, None] * square[:, None])
 
     def spread(self, k: np.ndarray) -> np.ndarray:
         """Return the transfer function of the further diffusion at wavenumbers [n] [rad/m], shape [n_channel, n]."""

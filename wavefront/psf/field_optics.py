@@ -127,6 +127,8 @@ class FieldOptics:
             path=np.broadcast_to(np.nan, (n_star, n_wave, n_pupil)),
             lit=np.repeat(self._lit(edges)[:, None], n_wave, axis=1),
             jacobian=jacobian,
+            exit_jacobian=np.broadcast_to(np.nan, jacobian.shape),
+            sphere_curvature=np.nan,
             reference_points=self.telescope.surfaces[-1].to_telescope(reference),
             reference_cosines=self._cosines(chief)[:, :2],
             fields=fields,

@@ -149,12 +149,13 @@ class LatticeTransfer:
         out = np.zeros((len(channels.wave), len(k)), dtype=np.complex64)
         if not lit.size:
             return out
-        star_optics = replace(star_optics, pupil=star_optics.pupil[lit])
+        pupil, displacement = star_optics.pupil[lit], star_optics.displacement[:, :, lit]
+        star_optics = replace(star_optics, pupil=pupil, displacement=displacement)
         path = star_optics.path[:, :, lit]
         if len(self.wavelengths) > 1:
-            path = path + np.einsum("wt,pt->wp", rays.path[star], self._terms(star_optics.pupil, _DEGREE))
+            path = path + np.einsum("wt,pt->wp", rays.path[star], self._terms(pupil, _DEGREE))
         path = channels.path(replace(star_optics, path=path))[0]
-        mean = star_optics.displacement[0, 0, lit].mean(axis=0, dtype=np.float64) + rays.shift[star][channels.wave]
+        mean = displacement[0, 0].mean(axis=0, dtype=np.float64) + rays.shift[star][channels.wave]
         if channels.shift.any():
             mean += channels.shift[:, None] * star_optics.exit_cosines[0].mean(axis=0)
         jacobian = star_optics.jacobian[0]
