@@ -53,9 +53,10 @@ def test_turning_the_camera_is_turning_all_else_the_other_way(lsst_r, air, heigh
     camera = decentred(lsst_r, DECENTRE).with_rotator(angle)
     mirror = decentred(lsst_r, turned(DECENTRE, -angle))
     options = {"atmosphere": air if engine == "long_exposure" else None, "focal_plane": heights, "threads": 1}
-    # One star on a small stamp is enough for the slow engine.
+    # One star is enough for the slow engine; so are the few points of the pupil of a small stamp where they turn into
+    # each other.
     places = POSITIONS if engine == "long_exposure" else POSITIONS[1:2]
-    options["stamps"] = Stamps() if engine == "long_exposure" else Stamps(15)
+    options["stamps"] = Stamps(15) if engine == "wave" and degrees == 90.0 else Stamps()
     spread = np.array([[1e-7, -3e-7]])
     one, other = (
         make_psfs(t, fields_at(t, places), pachon.Light(ONE_WAVE, dispersion=d), engine=engine, **options).image
