@@ -142,7 +142,7 @@ def test_power_is_split_without_loss_or_overlap():
         high = screen(HIGH, band=(cutoff, math.inf), fixed_modulus=True)
         total = np.mean(low.astype(float) ** 2) + np.mean(high.astype(float) ** 2)
         # The screen of 328 m lacks its mean: 0.265 (L0/L)^2 = 0.15 % of the variance.
-        assert total == pytest.approx(variance * (1.0 - 0.265 * (L0 / LENGTH) ** 2), rel=3e-4)
+        assert total == pytest.approx(variance * (1.0 - 0.265 * (L0 / LENGTH) ** 2), rel=3e-4, abs=0.0)
 
 
 @pytest.mark.long
