@@ -50,6 +50,8 @@ def coarse_pictures():
     layout = ConstrainedLayoutEngine.execute
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pachon.core.plotting._DPI", 60)
+        # The default of an argument is that of the import.
+        patch.setattr("pachon.core.plotting.picture_bytes.__defaults__", (60,))
         patch.setattr(ConstrainedLayoutEngine, "execute", lambda self, figure: None)
         yield layout
 

@@ -121,7 +121,7 @@ def _few_galaxies_and_pixels():
     from pachon.studies.reproduce import visits
     from pachon.studies.visits import null_test
 
-    plotting._DPI = 60
+    plotting.picture_bytes.__defaults__ = (60,)
     null_test.FAINTEST_SNR = 60.0
     visits._FAINTEST = 25.0
 

@@ -41,6 +41,14 @@ def module_of(path):
 MODULES = {module_of(path): path for path in FILES}
 
 
+def statements_of(node):
+    """Statements in a node and in its own, which alone import."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, (ast.stmt, ast.ExceptHandler, ast.match_case)):
+            yield child
+            yield from statements_of(child)
+
+
 @cache
 def imports_of(path):
     """Modules of pachon that a file imports, wherever in it."""
@@ -49,7 +57,7 @@ def imports_of(path):
 
 def _imports_of(path):
     package = path.relative_to(ROOT).parent.parts
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in statements_of(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.level:
             start = package[: len(package) - node.level + 1]
             module = ".".join([*start, *([node.module] if node.module else [])])

@@ -3,9 +3,11 @@
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+import yaml
 from astropy.io import fits
 
 from pachon.commands.cli import main
@@ -14,6 +16,7 @@ from pachon.core.long_work import Execution
 from pachon.core.progress import Reporter
 from pachon.measure.adaptive_moments import adaptive_moments
 from pachon.measure.correlation import shear_correlation
+from pachon.models.camera.cameras import load_camera
 from pachon.pipeline import focal_plane_stage, run_folder
 from pachon.pipeline.config import to_yaml
 from pachon.pipeline.experiment import Experiment
@@ -38,6 +41,20 @@ ADDED = ["CCD_E1", "CCD_E2", "CCD_SIZE", "CCD_G1", "CCD_G2", "CCD_SIG", "SIG_E1"
 @pytest.fixture
 def no_report(monkeypatch):
     monkeypatch.setattr("pachon.pipeline.report.pictures.draw_pictures", lambda *_: [])
+
+
+@pytest.fixture(scope="module")
+def focal_plane_config(focal_plane_config, tmp_path_factory):
+    """The configuration of two CCDs on a camera of their raft alone: heights of 9 CCDs are fitted, not of 189."""
+    lsst = load_camera("lsst")
+    raft = [i for i, name in enumerate(lsst.ccd_names) if name.startswith("R22")]
+    ccds = [
+        {"name": lsst.ccd_names[i], "raft": "R22", "x_mm": x, "y_mm": y, "pixels": lsst.pixels[i].tolist()}
+        for i, (x, y) in zip(raft, (1e3 * lsst.centers[raft]).tolist(), strict=True)
+    ]
+    path = tmp_path_factory.mktemp("camera") / "raft.yaml"
+    path.write_text(yaml.safe_dump({"name": "raft", "source": "test", "pixel_um": 10, "ccds": ccds}))
+    return partial(focal_plane_config, camera=str(path), focal_plane__budget="simulated")
 
 
 @pytest.fixture(scope="module")

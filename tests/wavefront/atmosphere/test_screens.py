@@ -23,7 +23,7 @@ CUTOFF = 1.4 / R0
 LOW, HIGH = (0.0, CUTOFF), (CUTOFF, math.inf)
 SIZE, LENGTH = 2048, 327.68
 PIXEL = LENGTH / SIZE
-FINE_SIZE, FINE_PIXEL = 3072, 0.014
+FINE_SIZE, FINE_PIXEL = 2048, 0.014
 RADIANS_PER_METRE = 2.0 * math.pi / 500e-9
 
 
@@ -81,7 +81,7 @@ def test_expected_structure_function_of_both_scales(direction):
 def test_random_screens_follow_theory():
     """Gaussian screens, averaged: measured by differences of samples, from two pixels to the outer scale."""
     lags = np.array([2, 8, 32, 156])  # 0.32 m to 24.96 m
-    count = 40
+    count = 16
     measured = np.zeros((count, len(lags)))
     for seed in range(count):
         field = screen(LOW, seed=seed)
@@ -137,12 +137,12 @@ def coherence(phase):
 @pytest.mark.long
 def test_power_is_split_without_loss_or_overlap():
     variance = path_variance(R0, L0)
-    for cutoff in (0.6 * CUTOFF, CUTOFF, 1.4 * CUTOFF):
+    for cutoff in (0.6 * CUTOFF, 1.4 * CUTOFF):
         low = screen(LOW, band=(0.0, cutoff), fixed_modulus=True)
         high = screen(HIGH, band=(cutoff, math.inf), fixed_modulus=True)
         total = np.mean(low.astype(float) ** 2) + np.mean(high.astype(float) ** 2)
         # The screen of 328 m lacks its mean: 0.265 (L0/L)^2 = 0.15 % of the variance.
-        assert total == pytest.approx(variance * (1.0 - 0.265 * (L0 / LENGTH) ** 2), rel=3e-4)
+        assert total == pytest.approx(variance * (1.0 - 0.265 * (L0 / LENGTH) ** 2), rel=3e-4, abs=0.0)
 
 
 @pytest.mark.long

@@ -68,7 +68,8 @@ def test_what_comes_back(lsst_r, engine, turbulent):
     focal_plane = pachon.FocalPlane.from_budget("lsst", seed=1)
     fields = fields_at(lsst_r, focal_plane.camera.centers[[94, 10]])
     offsets = np.array([[0.0, 0.0], [0.4, -0.3]])
-    done = []
+    # A small stamp holds what is sharp, and needs few points of the pupil.
+    size, done = 25 if turbulent else 15, []
     psfs = make_psfs(
         lsst_r,
         fields * u.rad,
@@ -78,11 +79,11 @@ def test_what_comes_back(lsst_r, engine, turbulent):
         threads=2,
         progress=done.append,
         engine=engine,
-        stamps=Stamps(25, offsets=offsets, pixel_size=10 * u.um),
+        stamps=Stamps(size, offsets=offsets, pixel_size=10 * u.um),
     )
-    assert psfs.image.shape == (2, 25, 25)
+    assert psfs.image.shape == (2, size, size)
     assert psfs.image.dtype == np.float32
-    # Single precision of 625 pixels.
+    # Single precision of up to 625 pixels.
     np.testing.assert_allclose(psfs.image.sum(axis=(1, 2)), 1.0, atol=1e-5)
     # 0.2 arcsec a pixel, to the "0.0197 arcsec/um" and 10.3 m of the LSST.
     assert psfs.pixel_scale == pytest.approx(0.2 * ARCSEC, rel=0.005)
@@ -104,7 +105,7 @@ def test_engines_agree_on_single_stars_outside_the_atmosphere(lsst_r):
     telescope = lsst_r.perturbed("Camera", shift=(0.0, 0.0, 30e-6))
     fields = np.radians([[0.0, 0.0], [0.8, 0.9], [-1.2, 0.3]])
     images = [
-        make_psfs(telescope, fields, WAVELENGTHS, threads=2, engine=engine, stamps=Stamps(21)).image.astype(float)
+        make_psfs(telescope, fields, WAVELENGTHS, threads=2, engine=engine, stamps=Stamps(15)).image.astype(float)
         for engine in ("fast", "wave")
     ]
     for fast, wave in zip(*images, strict=True):
