@@ -56,8 +56,7 @@ def test_focal_length_of_a_turned_and_stretched_jacobian():
     np.testing.assert_allclose(focal_length(np.stack([jacobian, 2 * np.eye(2)])), [np.sqrt(104.0), 2.0])
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("engine", ["fast", "wave"])
+@pytest.mark.parametrize("engine", ["fast", pytest.param("wave", marks=pytest.mark.slow)])
 def test_jitter_adds_to_the_variance_of_an_image(lsst_r, engine):
     """Seeing of 0.5 arcsec, unweighted moments over 13 arcsec, in which all but the far wings lie."""
     atmosphere = Atmosphere.from_site(

@@ -149,7 +149,9 @@ def test_engines_agree_through_the_same_screens(lsst_r):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("engine", [pytest.param(e, marks=[pytest.mark.slow] * (e == "statistical")) for e in ENGINES])
+@pytest.mark.parametrize(
+    "engine", [pytest.param(e, marks=[pytest.mark.slow] * (e in ("statistical", "wave"))) for e in ENGINES]
+)
 def test_recentred_stars_are_those_drawn_at_the_other_place(lsst_r, engine):
     """Told where a star is seen, an engine draws it where it then is seen at the centre of a pixel."""
     fields = np.radians([[0.3, -0.2], [1.1, 0.9]])
