@@ -204,7 +204,7 @@ class _Strips:
         return mean
 
     def mean_slope(self) -> np.ndarray:
-        """Return the derivatives of these by the lean."""
+        """Derivatives of these by the lean."""
         small = np.abs(self.lean) < _SMALL_LEAN
         lean = np.where(small, np.float32(1.0), self.lean)
         return np.where(small, self.lean / np.float32(-3.0), (np.cos(lean) - np.sin(lean) / lean) / lean)
@@ -229,7 +229,7 @@ def pupil_rims(telescope: Telescope, direction: np.ndarray, wavelength: float, p
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     edges = clear_edges(_annular_apertures_only(telescope), direction[None], unit, wavelength, threads=1)[0]
     reach = 0.5 * telescope.pupil_diameter
-    area, pieces_of_rims = 0.0, []
+    area, points, normals, parts, curvatures = 0.0, [], [], [], []
     for side, sign in ((0, 1.0), (1, -1.0)):
         rim = edges[:, side, None] * unit
         aimed = aimed_points(telescope, direction[None], wavelength, rim)
@@ -241,12 +241,14 @@ def pupil_rims(telescope: Telescope, direction: np.ndarray, wavelength: float, p
         # Where a spoke is dark its two ends are one point, and no light passes between them.
         shining = (edges[:, 1] > edges[:, 0]) & (length > 0.0)
         across = np.stack([along[:, 1], -along[:, 0]], axis=-1)[shining] / length[shining, None]
+        points.append(rim[shining])
+        normals.append(sign * across)
+        parts.append(length[shining])
         curved = sign * (along[:, 0] * bend[:, 1] - along[:, 1] * bend[:, 0])[shining] / length[shining] ** 3
         # Corners, where one rim begins to vignette, count as what curves most.
-        curved = np.clip(curved, -_MOST_CURVED / reach, _MOST_CURVED / reach)
-        pieces_of_rims.append((rim[shining], sign * across, length[shining], curved))
-    points, normals, lengths, curvatures = (np.concatenate(v) for v in zip(*pieces_of_rims, strict=True))
-    return PupilRims(points, normals, lengths / max(area, 1e-300), curvatures, pieces)
+        curvatures.append(np.clip(curved, -_MOST_CURVED / reach, _MOST_CURVED / reach))
+    points, normals, curvatures = (np.concatenate(v) for v in (points, normals, curvatures))
+    return PupilRims(points, normals, np.concatenate(parts) / max(area, 1e-300), curvatures, pieces)
 
 
 def _annular_apertures_only(telescope: Telescope) -> Telescope:
