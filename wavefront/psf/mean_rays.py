@@ -3,7 +3,7 @@
 The sums of :mod:`.long_exposure` over few points of the pupil are right where the phase varies slowly from one point to
 the next. Far from focus, a dense bundle of rays is binned as in :mod:`.fast`, and filtered by the mean transfer
 function of the atmosphere. The strips along the rims of the pupil that diffraction takes away are those of
-:mod:`.pupil_rims`; where spiders or apertures of other shapes stop light, theirs are left out.
+:mod:`.pupil_rims`.
 """
 
 from __future__ import annotations

@@ -14,22 +14,25 @@ light of the rim lands, and m the change of this place per metre towards the lit
 of the strip, and its sinc the mean over the strip, which matters on a small pupil of long focal length: without it
 strips of AuxTel are wrong by as much as they are. A rim of curvature c, positive where the lit side is convex, has
 strips that are wider and shorter than those of a straight one.
+
+A vane of width t has its shadow at both ends of the baseline, and where it stands itself, between them, light is not
+lost: :math:`w` and the sinc give way to :math:`(2 \cos 2h' - 1)\, t - \max(t - 2w, 0)` with :math:`2h' = w\, \kappa
+\cdot m` of its middle, which is :math:`2w` for a wide one.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ...models.telescope import Telescope
-from ...raytrace.launch import aimed_points
-from ...raytrace.pack.surfaces import clear_annulus
 from ..atmosphere.turbulence import diffraction_otf
 from ..pupil_polynomials import PupilPolynomials
-from .clear_pupil import clear_edges
+from .clear_pupil import clear_edges, has_only_annuli
+from .pupil_scan import no_vanes, points_of_plane, scanned_edges, scanned_vanes
 
 #: Pieces of each rim: two pixels of a donut of 120.
 PIECES = 192
@@ -49,7 +52,7 @@ _CHUNK = 128
 
 @dataclass(frozen=True)
 class PupilRims:
-    """Pieces of the rims of the clear pupil of one star.
+    """Pieces of the rims of the clear pupil of one star, those of vanes last.
 
     Attributes
     ----------
@@ -61,6 +64,8 @@ class PupilRims:
         Lengths of the pieces over the area of the clear pupil [1/m].
     curvatures : ndarray, shape [n]
         Curvatures of the rims [1/m], positive where the lit side is convex.
+    vane_widths : ndarray, shape [n_vane]
+        Widths of the last pieces, which are middles of vanes [m].
     pieces : int
         Pieces that each rim was divided into, dark ones among them.
     """
@@ -69,6 +74,7 @@ class PupilRims:
     normals: np.ndarray
     parts: np.ndarray
     curvatures: np.ndarray
+    vane_widths: np.ndarray = field(default_factory=lambda: np.zeros(0))
     pieces: int = PIECES
 
     def landing(self, smooth: PupilPolynomials, landing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -97,7 +103,7 @@ class PupilRims:
         """
         out = np.empty(len(wave), dtype=np.complex64)
         for strips in self._strips(baseline, wave, landing, inward):
-            light = strips.light * strips.mean()
+            light = strips.amplitude()
             out[strips.piece].real = np.einsum("fn,fn->f", light, np.cos(strips.phase))
             out[strips.piece].imag = -np.einsum("fn,fn->f", light, np.sin(strips.phase))
         return out
@@ -119,14 +125,17 @@ class PupilRims:
         values, out = (np.empty((len(wave), *shape), dtype=np.complex64) for shape in ((), response.shape[2:]))
         moved, leant = response.astype(np.float32), inward_response.astype(np.float32)
         for strips in self._strips(baseline, wave, landing, inward):
-            light, cosine, sine = strips.light * strips.mean(), np.cos(strips.phase), np.sin(strips.phase)
+            light, cosine, sine = strips.amplitude(), np.cos(strips.phase), np.sin(strips.phase)
             real, imaginary = light * cosine, -light * sine
             values[strips.piece].real, values[strips.piece].imag = real.sum(axis=1), imaginary.sum(axis=1)
             slopes = [(imaginary @ v, -(real @ v)) for v in moved]
             if strips.wide:
                 # What the phase changes across a strip goes with that of its middle, and changes the mean.
-                half, change = 0.5 * strips.width, 0.5 * strips.width * strips.light * strips.mean_slope()
-                by_lean = half * imaginary + change * cosine, -half * real - change * sine
+                half, change = 0.5 * strips.width, 0.5 * strips.width * strips.amplitude_slope()
+                by_lean = change * cosine, -change * sine
+                rims = np.s_[:, : strips.rims]
+                by_lean[0][rims] += half[rims] * imaginary[rims]
+                by_lean[1][rims] -= half[rims] * real[rims]
                 for along, v in zip(slopes, leant, strict=True):
                     for slope, lean in zip(along, by_lean, strict=True):
                         slope += lean @ v
@@ -142,6 +151,7 @@ class PupilRims:
         across, places, steps = (v.T.astype(np.float32) for v in (0.5 * self.normals, landing, 0.5 * inward))
         straight, bent = (v.astype(np.float32) for v in (-self.parts, self.parts * self.curvatures))
         narrow = _NARROW * float(np.abs(self.points).max(initial=0.0))
+        rims, thick = len(self.points) - len(self.vane_widths), self.vane_widths.astype(np.float32)
         steepest = math.sqrt(float((steps**2).sum(axis=0).max(initial=0.0)))
         for first in range(0, len(wave), _CHUNK):
             piece = slice(first, first + _CHUNK)
@@ -157,8 +167,9 @@ class PupilRims:
             if wide:
                 light += bent * width * width - np.outer(np.float32(0.125) * square, bent)
             phase = k @ places
-            phase += lean
-            yield _Strips(piece, k, light, width, lean, phase, most, wide)
+            phase[:, :rims] += lean[:, :rims]
+            light[:, rims:] = straight[rims:]
+            yield _Strips(piece, k, light, width, lean, phase, most, wide, rims, thick)
 
 
 @dataclass(frozen=True)
@@ -172,13 +183,17 @@ class _Strips:
     wave : ndarray, shape [n_frequency, 2]
         Their wave vectors [rad/m].
     light : ndarray, shape [n_frequency, n]
-        Fractions of the light in the strips, negative.
+        Fractions of the light in the strips, negative; of vanes over their width.
     width, lean, phase : ndarray, shape [n_frequency, n]
         Widths of the strips [m], phase of their middles against the rim, and phase there [rad].
     most : float
         A bound of the lean [rad].
     wide : bool
         Whether strips are so wide that the curvature of the rim, and changes of the lean, matter.
+    rims : int
+        Number of the pieces before those of vanes.
+    vane_widths : ndarray, shape [n - rims]
+        Widths of these [m].
     """
 
     piece: slice
@@ -189,9 +204,32 @@ class _Strips:
     phase: np.ndarray
     most: float
     wide: bool
+    rims: int
+    vane_widths: np.ndarray
+
+    def amplitude(self) -> np.ndarray:
+        """Return the light of the strips by the mean of its waves, those of vanes together, [n_frequency, n].
+
+        Shadows of a vane at both ends of the baseline take light, but the vane none where it is between them.
+        """
+        light = self.light * self.mean()
+        if len(self.vane_widths):
+            lean, width = (v[:, self.rims :] for v in (self.lean, self.width))
+            shadows = (2.0 * np.cos(2.0 * lean) - np.float32(1.0)) * self.vane_widths
+            shadows -= np.maximum(self.vane_widths - 2.0 * width, 0.0)
+            light[:, self.rims :] = self.light[:, self.rims :] * shadows
+        return light
+
+    def amplitude_slope(self) -> np.ndarray:
+        """Return the derivatives of these by the lean."""
+        slope = self.light * self.mean_slope()
+        if len(self.vane_widths):
+            vanes = np.s_[:, self.rims :]
+            slope[vanes] = np.float32(-4.0) * self.light[vanes] * np.sin(2.0 * self.lean[vanes]) * self.vane_widths
+        return slope
 
     def mean(self) -> np.ndarray:
-        """Means of the waves over the strips, over those at their middles."""
+        """Return the means of the waves over the strips, over those at their middles."""
         terms = next((n for n, most in enumerate(_SERIES, 1) if self.most < most), 0)
         if not terms:
             return np.sinc(self.lean / np.float32(math.pi))
@@ -204,7 +242,7 @@ class _Strips:
         return mean
 
     def mean_slope(self) -> np.ndarray:
-        """Derivatives of these by the lean."""
+        """Return the derivatives of these by the lean."""
         small = np.abs(self.lean) < _SMALL_LEAN
         lean = np.where(small, np.float32(1.0), self.lean)
         return np.where(small, self.lean / np.float32(-3.0), (np.cos(lean) - np.sin(lean) / lean) / lean)
@@ -221,19 +259,20 @@ def strip_overlap(baseline: np.ndarray, diameter: float, obscuration: float) -> 
 
 
 def pupil_rims(telescope: Telescope, direction: np.ndarray, wavelength: float, pieces: int = PIECES) -> PupilRims:
-    """Return the rims of the clear pupil for light of one direction [3]; discs and rings alone, in so many pieces.
-
-    Spiders, and apertures of other shapes, are left out.
-    """
+    """Return the rims of the clear pupil for light of one direction [3], each in so many pieces, and its vanes."""
     angle = 2.0 * math.pi * (np.arange(pieces) + 0.5) / pieces
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    edges = clear_edges(_annular_apertures_only(telescope), direction[None], unit, wavelength, threads=1)[0]
+    vanes = no_vanes()
+    if has_only_annuli(telescope):
+        edges = clear_edges(telescope, direction[None], unit, wavelength, threads=1)[0]
+    else:
+        edges = scanned_edges(telescope, direction, unit, wavelength)
+        vanes = scanned_vanes(telescope, direction, edges, wavelength)
     reach = 0.5 * telescope.pupil_diameter
     area, points, normals, parts, curvatures = 0.0, [], [], [], []
     for side, sign in ((0, 1.0), (1, -1.0)):
         rim = edges[:, side, None] * unit
-        aimed = aimed_points(telescope, direction[None], wavelength, rim)
-        rim = aimed[0] if aimed.ndim == 3 else rim
+        rim = points_of_plane(telescope, direction, wavelength, rim)
         before, after = np.roll(rim, 1, axis=0), np.roll(rim, -1, axis=0)
         along, bend = 0.5 * (after - before), after - 2.0 * rim + before
         area -= 0.5 * sign * float((rim[:, 0] * along[:, 1] - rim[:, 1] * along[:, 0]).sum())
@@ -248,12 +287,12 @@ def pupil_rims(telescope: Telescope, direction: np.ndarray, wavelength: float, p
         # Corners, where one rim begins to vignette, count as what curves most.
         curvatures.append(np.clip(curved, -_MOST_CURVED / reach, _MOST_CURVED / reach))
     points, normals, curvatures = (np.concatenate(v) for v in (points, normals, curvatures))
-    return PupilRims(points, normals, np.concatenate(parts) / max(area, 1e-300), curvatures, pieces)
-
-
-def _annular_apertures_only(telescope: Telescope) -> Telescope:
-    """Return the telescope without obstructions, and without apertures other than discs and rings."""
-    surfaces = tuple(
-        s if clear_annulus(s.aperture) is not None else replace(s, aperture=None) for s in telescope.surfaces
+    area = max(area - float((vanes.lengths * vanes.widths).sum()), 1e-300)
+    return PupilRims(
+        np.concatenate([points, vanes.points]),
+        np.concatenate([normals, vanes.normals]),
+        np.concatenate([*parts, vanes.lengths]) / area,
+        np.concatenate([curvatures, np.zeros(len(vanes.points))]),
+        vanes.widths,
+        pieces,
     )
-    return replace(telescope, surfaces=surfaces, obstructions=())
