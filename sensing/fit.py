@@ -173,16 +173,15 @@ def fit_donuts(
 
     with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
 
-        def alone(instrument: Instrument, i: int, by_rays: StarFit | None = None) -> StarFit:
+        def alone(instrument: Instrument, i: int, begun: StarFit | None = None) -> StarFit:
             star, defocus, strength = observed.star(i), float(shifts[i]), float(strengths[i])
-            return _fit_alone(instrument, star, defocus, strength, fit.joint, by_rays)
+            return _fit_alone(instrument, star, defocus, strength, fit.joint, begun)
 
         def fitted_stars(
-            instrument: Instrument, by_rays: dict[int, StarFit], report: Callable[[int], None] | None
+            instrument: Instrument, star_fit: Callable[[int], StarFit], report: Callable[[int], None] | None = None
         ) -> _Fitted:
             def prepared(i: int) -> StarFit:
-                ready = by_rays.get(i)
-                star = alone(instrument, i, ready) if ready is None or instrument.model.diffraction else ready
+                star = star_fit(i)
                 if report is not None:
                     report(1)
                 return fit.prepared(instrument, star)
@@ -197,19 +196,26 @@ def fit_donuts(
             )
             return _Fitted(stars, solutions, fit.solved(usable, pool))
 
+        def first(i: int) -> StarFit:
+            ready = by_rays.get(i)
+            return alone(instrument, i, ready) if ready is None or instrument.model.diffraction else ready
+
+        def once_more(refined: Instrument) -> _Fitted:
+            return fitted_stars(refined, lambda i: alone(refined, i, replace(fitted.stars[i], searched=True)))
+
         by_rays: dict[int, StarFit] = {}
         if model.diffraction is None:
-            by_rays, diffraction = _by_rays(instrument, lambda i: alone(instrument, i), len(observed), pool)
+            by_rays, diffraction = _by_rays(instrument, partial(alone, instrument), len(observed), pool)
             model = replace(model, diffraction=diffraction)
             instrument = replace(instrument, model=model)
-        fitted = fitted_stars(instrument, by_rays, progress)
+        fitted = fitted_stars(instrument, first, progress)
         refined = fit.refined(instrument, list(fitted.solutions.values()), fitted.results)
         if refined is not None:
-            again = fitted_stars(refined, {}, None)
+            again = once_more(refined)
             if refined.free_rims.bodies and contradicted(fitted.solutions, again.solutions):
                 # Not the telescope's: each donut keeps the rims of its own fit.
                 refined = replace(refined, free_rims=instrument.free_rims)
-                again = fitted if refined.terms is instrument.terms else fitted_stars(refined, {}, None)
+                again = fitted if refined.terms is instrument.terms else once_more(refined)
             instrument, fitted = refined, again
     result = _result(instrument, observed, fitted)
     warn_of_other_hole(instrument, fitted.solutions, result)
@@ -255,9 +261,9 @@ def _by_rays(
 
 
 def _fit_alone(
-    instrument: Instrument, star: ObservedStar, defocus: float, strength: float, joint: bool, by_rays: StarFit | None
+    instrument: Instrument, star: ObservedStar, defocus: float, strength: float, joint: bool, begun: StarFit | None
 ) -> StarFit:
-    """Fit one star by itself, from a fit by rays if there is one, or say why not."""
+    """Fit one star by itself, from a fit of a simpler model if there is one, or say why not."""
     if np.hypot(*star.field) > instrument.telescope.field_limit * (1.0 + 1e-12):
         return StarFit(DonutFlag.OUTSIDE_FIELD)
     try:
@@ -269,7 +275,7 @@ def _fit_alone(
     saturated = _saturated(np.where(masked, 0.0, star.image), masked, instrument.model.detector.saturation)
     masked = masked | grown(saturated, ~masked)
     wavefront = not joint or light.diameter > SMALLEST_DONUT * instrument.pixel
-    fitted = _fit_with_noise(instrument, light, star, ~masked, strength, wavefront, by_rays)
+    fitted = _fit_with_noise(instrument, light, star, ~masked, strength, wavefront, begun)
     if fitted.flags.usable:
         return replace(fitted, flags=fitted.flags | DonutFlag.CLIPPED) if (saturated | not_finite).any() else fitted
     if saturated.sum() > max(_SEVERAL * star.image.size, 1.0):
@@ -286,28 +292,28 @@ def _fit_with_noise(
     used: np.ndarray,
     strength: float,
     wavefront: bool,
-    by_rays: StarFit | None,
+    begun: StarFit | None,
 ) -> StarFit:
     """Fit the used pixels of one star with its known noise, or with noise and sky level that are measured."""
     fit = partial(fit_star, instrument, light, strength=strength, wavefront=wavefront)
     image = np.where(used, star.image, 0.0)
     if star.known_noise:
-        return fit(Pixels(image, star.variance, used), begun=by_rays)
+        return fit(Pixels(image, star.variance, used), begun=begun)
     smooth = smoothed(image, used)
     level = faint_level(smooth, used)
     image = np.where(used, star.image - level, 0.0)
-    if by_rays is None or by_rays.usable is None:
+    if begun is None or begun.usable is None:
         noise = measured_noise(image, smooth - level, used, level)
     else:
-        noise = PixelNoise(float(by_rays.usable.full.variance.mean()) * by_rays.unit**2, by_rays.unit)
+        noise = PixelNoise(float(begun.usable.full.variance.mean()) * begun.unit**2, begun.unit)
     for _ in range(_NOISE_FITS):
         unit = noise.photon
         pixels = Pixels(image / unit, np.full(image.shape, noise.sky / unit**2), used)
-        fitted = fit(pixels, sky_level=level / unit, begun=by_rays)
+        fitted = fit(pixels, sky_level=level / unit, begun=begun)
         if 1.0 / _NOISE_AGREES < fitted.unit < _NOISE_AGREES:
             break
         noise = replace(noise, sky=noise.sky * fitted.unit, photon=unit * fitted.unit)
-        by_rays = None
+        begun = None
     return replace(fitted, unit=unit * fitted.unit, level=level)
 
 

@@ -66,6 +66,8 @@ class StarFit:
         The image is that of the solution, whose light has the noise of electrons, times a unit, above a level.
     sides : BothSides, optional
         Fits on both sides of focus.
+    searched : bool
+        Whether its search holds for a fit that begins from it, which has further Zernikes, or the rims of all stars.
     """
 
     flags: DonutFlag
@@ -73,6 +75,7 @@ class StarFit:
     unit: float = 1.0
     level: float = 0.0
     sides: BothSides | None = None
+    searched: bool = False
 
     @property
     def usable(self) -> StarSolution | None:
@@ -104,14 +107,14 @@ def fit_star(
         Light of the sky that was taken off, where noise is not known: that of the result is what the fit leaves, in a
         unit in which light has the noise of electrons.
     begun : StarFit, optional
-        Fit of a model without diffraction, in the same unit, from which this one begins if its search left no question.
+        Fit of a model without diffraction, or without some of the Zernikes, in the same unit, from which this one
+        begins if its search left no question.
     """
     across = light.diameter / instrument.pixel
     donut = across > SMALLEST_DONUT
     fitter = StarFitter(instrument, light, without_bad_pixels(pixels) if donut else pixels, strength, wavefront)
-    if begun is not None and begun.usable is not None and not begun.flags & ~_BESIDE_THE_SEARCH:
-        shape = begun.usable.full.used.shape
-        return _finished(fitter.central(shape), pixels.central(shape), begun.usable.solution, begun.sides, sky_level)
+    if begun is not None and begun.usable is not None and _holds(begun, light):
+        return _continued(fitter, pixels, begun, begun.usable, sky_level)
     fitter, start = _started(fitter)
     pixels = pixels.central(fitter.clean.image.shape)
     flags = DonutFlag.OK
@@ -141,6 +144,37 @@ def fit_star(
     if fitter.lost_light(start.stamp, best).any_pixel > _LOST:
         return StarFit(DonutFlag.MOSTLY_LOST)
     return _finished(fitter, pixels, best, sides, sky_level, search.rivals)
+
+
+def _holds(begun: StarFit, light: StarLight) -> bool:
+    """Return whether the search of a fit holds for one of other light that begins from it."""
+    if not begun.searched:
+        return not begun.flags & ~_BESIDE_THE_SEARCH
+    # Light beside a rim looks like a neighbour.
+    return not (light.free_rims.bodies and DonutFlag.BLENDED in begun.flags)
+
+
+def _continued(
+    fitter: StarFitter, pixels: Pixels, begun: StarFit, best: StarSolution, sky_level: float | None
+) -> StarFit:
+    """Return the outcome of a fit from the best model of one that has begun, with its rims if none are those of all."""
+    shape, solution, own_rims = best.full.used.shape, best.solution, best.light.free_rims
+    fitter, of_all = fitter.central(shape), fitter.light.free_rims
+    fitter = fitter if of_all.bodies else fitter.with_free_rims(own_rims)
+    last = len(solution.shared) - len(own_rims)
+    known = last - best.light.before_free_rims
+    further = np.zeros(len(fitter.instrument.noll) - known if len(solution.shared) else 0)
+    steps = np.zeros(len(of_all)) if of_all.bodies else solution.shared[last:]
+
+    def begin(wave: np.ndarray) -> Solution:
+        return replace(solution, shared=np.concatenate([wave, further, solution.shared[known:last], steps]))
+
+    own_rivals = () if of_all.bodies else best.rivals
+    rivals = tuple(
+        RimFit(fitter.with_free_rims(rival.rims).light, best.stamp, begin(rival.wave)) for rival in own_rivals
+    )
+    best_begun = begin(solution.shared[:known])
+    return _finished(fitter, pixels.central(shape), best_begun, begun.sides, sky_level, rivals)
 
 
 class CoarseFit(NamedTuple):

@@ -41,6 +41,8 @@ _SHORT = 0.8
 #: Times that this is done for each rim in the search, and for the best of them.
 _FIRST_STEPS = 2
 _FINISHED = 2
+#: Gain after these first times over that which is needed, from which on the best are finished.
+_HALF_WAY = 0.5
 #: Times that the shadows of a rim are computed again where it is found to stand.
 _OUTER = 6
 #: Loss over that of the best from which on they are not.
@@ -109,14 +111,12 @@ def with_another_rim(
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
         if not gains.max(initial=0.0) > least + _PROMISING * misfit:
             break
-        limit = best.solution.loss
         if first is None:
             likely = gains > _LIKELY * gains.max()
-            trials = _each_freed(
-                instrument, best, list(itertools.compress(bodies, likely)), best.solution, solved, limit
-            )
+            tried = list(itertools.compress(bodies, likely))
+            trials = _each_freed(instrument, best, tried, best.solution, solved, threshold)
         else:
-            trials = _each_freed(instrument, best, bodies, first, solved, limit)
+            trials = _each_freed(instrument, best, bodies, first, solved, threshold)
         gain = best.solution.loss - trials[0].solution.loss
         if gain >= threshold:
             return _best_of(trials)
@@ -180,19 +180,22 @@ def _each_freed(
     bodies: Sequence[RimBody],
     start: Solution,
     solved: RimSolver,
-    limit: float,
+    needed: float,
 ) -> list[RimFit]:
     """Return fits with one more of some bodies free, best first: those that lead nowhere end after a few steps.
 
-    So do those that will not get below a limit of the loss.
+    So do those that gain nothing, and those whose gain is then far from what is needed.
     """
     trials = []
     for body in bodies:
         light = fit.light.with_free_rims(fit.light.free_rims.with_body(body), instrument.middle)
         # A rim that stands far off gains little before its shadow is computed where it is first found to stand.
-        trials.append(settled(instrument, solved(light, start), solved, _FIRST_STEPS, limit))
+        trials.append(settled(instrument, solved(light, start), solved, _FIRST_STEPS, fit.solution.loss))
     trials.sort(key=lambda trial: trial.solution.loss)
-    close = [trial for trial in trials if trial.solution.loss < _CLOSE * trials[0].solution.loss]
+    best = trials[0].solution.loss
+    if fit.solution.loss - best < _HALF_WAY * needed:
+        return trials
+    close = [trial for trial in trials if trial.solution.loss < _CLOSE * best]
     finished = [settled(instrument, trial, solved) for trial in close[:_FINISHED]]
     return sorted(finished, key=lambda trial: trial.solution.loss)
 
@@ -252,14 +255,15 @@ def settled(
         if np.all(np.abs(factor * step) < _SMALL):
             break
         light = best.light.with_free_rims(rims.moved(factor * step * rims.spreads), instrument.middle)
-        trial = solved(light, best.solution, hopeless)
-        if trial.solution.loss > hopeless:
-            break
         # Light that a shadow uncovers lies beside the line that stands for it: steps may be too long, and the loss
         # after one is not that of the rims there.
+        alike = _ALIKE * max(1.0, best.solution.loss / best.stamp.used.sum())
+        trial = solved(light, best.solution, min(hopeless, best.solution.loss + alike))
+        if trial.solution.loss > hopeless:
+            break
         worse = trial.solution.loss - best.solution.loss
         nearer = np.linalg.norm(_relative_step(instrument, trial)) < np.linalg.norm(step)
-        if worse < 0.0 or (nearer and worse < _ALIKE * max(1.0, best.solution.loss / best.stamp.used.sum())):
+        if worse < 0.0 or (nearer and worse < alike):
             best, factor = replace(trial, rivals=best.rivals), 1.0
         else:
             factor *= 0.5

@@ -27,6 +27,9 @@ _NEAR = 1.0
 _EXPLAINED = 1e-2
 #: Damping of the first step, in units of the curvature.
 _DAMPING = 1e-3
+#: Part of the gain that a step predicts from which on the next one is damped less: where derivatives are not exact, the
+#: damping that a step needed is that of the next one.
+_AS_PREDICTED = 0.5
 #: Least strength of the turbulence [1/m].
 _LEAST_STRENGTH = 1e-3
 #: Least exponent of the air's transfer function after a step over that before: images are then a fifth as wide.
@@ -156,7 +159,8 @@ def solve(
             break
         trial_state = _linearize(group, trial, sizes, pool)
         if trial_state.loss < state.loss:
-            joined, state, damping = trial, trial_state, 0.1 * damping
+            gain = (state.loss - trial_state.loss) / predicted
+            joined, state, damping = trial, trial_state, damping * (0.1 if gain > _AS_PREDICTED else 1.0)
         else:
             damping = 10.0 * max(damping, _DAMPING)
             if damping > _LARGEST_DAMPING or predicted < _worth(state.loss, pixels):

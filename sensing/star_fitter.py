@@ -179,6 +179,10 @@ class StarFitter:
         fitter._set_light(light)
         return fitter
 
+    def with_free_rims(self, rims: FreeRims) -> StarFitter:
+        """Return the same with rims free where these stand."""
+        return self.with_light(self._light.with_free_rims(rims, self.instrument.middle)) if rims.bodies else self
+
     def rim_solver(self, tolerance: float, stamp_of: Callable[[StarFitter], Stamp]) -> RimSolver:
         """Return the function that fits light with its rims elsewhere, from the unknowns of a solution."""
 
