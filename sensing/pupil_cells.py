@@ -8,7 +8,8 @@ but for the third moments of cells on rims.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,7 +22,7 @@ from ..raytrace.launch import aimed_points
 from ..raytrace.rays import RayStatus, parallel_rays
 from ..raytrace.trace import trace
 from ..wavefront.pupil_polynomials import PupilPolynomials
-from .rim_outlines import is_vane, simple_regions
+from .rim_outlines import Simple, is_vane, simple_regions, widened
 
 #: Side of the lattice over the diameter of the pupil: light off the axis may cross the plane of the stop just outside.
 _MARGIN = 1.02
@@ -36,6 +37,8 @@ _SMALL = 120
 _NODES = 5
 #: Pieces that each division makes.
 _PARTS = 4
+#: Points along each side of the lattice whose light says where vanes stand on the pupil.
+_SURVEY = 13
 #: Points of the rim that the width of an aimed beam is taken from.
 _RIM = 48
 
@@ -160,13 +163,16 @@ def pupil_cells(telescope: Telescope, direction: np.ndarray, wavelength: float, 
     # Four points of each cell; a rim passes cells where these or those next to them differ.
     along = (np.arange(2 * across) - 0.5 * (2 * across - 1)) * 0.5 * side
     lattice = np.stack(np.meshgrid(along, along), axis=-1) + center
-    # Thin shadows may lie between the points of half a lattice.
-    regions = (region for s in telescope.surfaces for region in simple_regions(s.aperture))
-    thin = bool(telescope.obstructions) or any(map(is_vane, regions))
+    # Thin shadows may lie between the points of half a lattice, and those of vanes between all of them.
+    regions = {i: list(filter(is_vane, simple_regions(s.aperture))) for i, s in enumerate(telescope.surfaces)}
+    vanes = {surface: of_surface for surface, of_surface in regions.items() if of_surface}
+    thin = bool(telescope.obstructions or vanes)
     status = lit(lattice) if thin else lit_lattice(lit, lattice)
     differ = maximum_filter(status, 3, mode="constant") != minimum_filter(status, 3, mode="constant")
     quarters = (across, 2, across, 2)
     area, rim = status.reshape(quarters).mean(axis=(1, 3)), differ.reshape(quarters).any(axis=(1, 3))
+    if vanes:
+        rim |= _crossed(telescope, direction, wavelength, vanes, centers, side)
     moments = np.tile(side**2 / 12.0 * np.eye(2), (across, across, 1, 1))
     if rim.any():
         smooth = uniform_filter(area, 3, mode="constant")
@@ -179,6 +185,33 @@ def pupil_cells(telescope: Telescope, direction: np.ndarray, wavelength: float, 
     total = max(float(area.sum()), 1e-300)
     weights = area[lit_cells] / total
     return PupilCells(centers[lit_cells], weights, moments[lit_cells], side, center, area=total)
+
+
+def _crossed(
+    telescope: Telescope,
+    direction: np.ndarray,
+    wavelength: float,
+    vanes: Mapping[int, Sequence[Simple]],
+    centers: np.ndarray,
+    side: float,
+) -> np.ndarray:
+    """Return which cells of a lattice of centres [n, n, 2] the shadows of vanes cross, by the numbers of surfaces."""
+    places = centers.reshape(-1, 2)
+    along = np.linspace(places[0], places[-1], _SURVEY)
+    survey = np.stack(np.meshgrid(*along.T), axis=-1).reshape(-1, 2)
+    ends = trace(telescope, parallel_rays(telescope, direction[None], wavelength, survey), "all", threads=1)
+    crossed = np.zeros(len(places), dtype=bool)
+    for surface, regions in vanes.items():
+        landing = telescope.surfaces[surface].to_local(ends[surface].position)[:, :2]
+        met = np.isfinite(landing).all(axis=1)
+        if not met.any():
+            continue
+        smooth = PupilPolynomials(survey[met], 0.5 * (places[0] + places[-1]), side)
+        x, y = smooth.at(places, landing[met])[0].T
+        largest = float(np.linalg.svd(smooth.derivatives(landing[met]), compute_uv=False).max())
+        for region in regions:
+            crossed |= widened(region, math.sqrt(2.0) * side * largest).contains(x, y)
+    return crossed.reshape(centers.shape[:-1])
 
 
 def _beam(telescope: Telescope, direction: np.ndarray, wavelength: float) -> tuple[np.ndarray, float]:

@@ -81,6 +81,13 @@ def vane_width(region: Simple) -> float:
     return min(region.width, region.height) if isinstance(region, Rectangle) else getattr(region, "width", 0.0)
 
 
+def widened(vane: Simple, margin: float) -> Simple:
+    """Return a vane that is wider, and longer if it has ends, by a margin [m]."""
+    if isinstance(vane, Rectangle):
+        return replace(vane, width=vane.width + margin, height=vane.height + margin)
+    return replace(vane, width=vane_width(vane) + margin)
+
+
 def simple_regions(aperture: Aperture | None) -> list[Simple]:
     """Return the regions of an aperture that have outlines, in the order that :func:`moved_aperture` counts."""
     if aperture is None:
