@@ -27,9 +27,9 @@ _NEAR = 1.0
 _EXPLAINED = 1e-2
 #: Damping of the first step, in units of the curvature.
 _DAMPING = 1e-3
-#: Part of the gain that a step predicts from which on the next one is damped less: where derivatives are not exact, the
-#: damping that a step needed is that of the next one.
-_AS_PREDICTED = 0.5
+#: Damping after a step whose gain is as predicted, over that before: where derivatives are not exact, that of the last
+#: step is nearly what the next one needs.
+_LESS = 1.0 / 3.0
 #: Least strength of the turbulence [1/m].
 _LEAST_STRENGTH = 1e-3
 #: Least exponent of the air's transfer function after a step over that before: images are then a fifth as wide.
@@ -160,7 +160,9 @@ def solve(
         trial_state = _linearize(group, trial, sizes, pool)
         if trial_state.loss < state.loss:
             gain = (state.loss - trial_state.loss) / predicted
-            joined, state, damping = trial, trial_state, damping * (0.1 if gain > _AS_PREDICTED else 1.0)
+            # Nielsen (1999): less where the gain is as predicted, more where it is less than half of that.
+            damping *= max(_LESS, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
+            joined, state = trial, trial_state
         else:
             damping = 10.0 * max(damping, _DAMPING)
             if damping > _LARGEST_DAMPING or predicted < _worth(state.loss, pixels):
