@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.statistics import RMS_PER_MAD
 from .donut_rays import ZernikeRays
-from .image_model import STRENGTH, LandedLight
+from .image_model import FLUX, STRENGTH, LandedLight
 from .light import Instrument, StarLight
 from .likelihood import Stamp, light_columns, linearized
 from .moving_rims import PupilShadows, RimBody, line_cells, steps_of_bounding
@@ -19,6 +19,8 @@ from .solve import Solution
 
 #: Least gain of twice the logarithm of the likelihood by a rim elsewhere: noise makes one in 1e5 of three motions.
 _GAIN = 25.0
+#: What the model of a pixel is off by, over its light: rims explain some of it where photons are so many.
+_INEXACT = 2e-3
 #: Side of the squares whose residuals say how far noise is correlated [pixels].
 _SQUARE = 4
 #: Least number of such squares beyond that of the unknowns.
@@ -104,7 +106,7 @@ def with_another_rim(
     loss = best.solution.loss / best.stamp.used.sum()
     while len(free) < MOST_BODIES and len(failed) < _MOST_FAILURES and loss >= noise:
         misfit = _MISFIT * max(loss - (noise or 1.0), 0.0) * best.stamp.used.sum()
-        least = _GAIN * _correlation(best)
+        least = _GAIN * _correlation(best) + _INEXACT**2 * float(best.solution.stars[0][FLUX])
         threshold = least + misfit
         bodies, gains = rim_gains(instrument, best)
         moved = {body.members for body in (*free, *failed)}
