@@ -42,7 +42,7 @@ def on_axis(behind_focus):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("r0", "left", "of_rays"), [(0.1045, 4e-9, 30e-9), (0.16, 8e-9, 40e-9)])
+@pytest.mark.parametrize(("r0", "left", "of_rays"), [(0.1045, 4e-9, 30e-9), (0.16, 8e-9, 30e-9)])
 def test_diffraction_is_not_taken_for_wavefront(behind_focus, on_axis, r0, left, of_rays):
     spectrum, kx, ky, cell, length = on_axis
     air = coherence(

@@ -84,8 +84,10 @@ def test_donuts_of_the_wave_engine_have_the_hole_of_the_mirror():
     donut = make_psfs(telescope, fields, [WAVE], engine="wave", stamps=Stamps(141, **options)).image
     model = pachon.DonutModel(air=pachon.DonutAir(fwhm=0.0), detector=pachon.DonutDetector(**options), diffraction=True)
     fit = pachon.fit_donuts(telescope, 1e7 * donut, fields, WAVE, sky_variance=1e4, model=model)
-    # Fresnel fringes at the rims, without air.
-    assert np.linalg.norm(fit.zernikes[0]) < 10e-9
+    astigmatism, error = fit.zernikes[0, 1:3], np.linalg.norm(fit.zernikes[0])
+    np.testing.assert_allclose(astigmatism, 0.0, atol=2e-9)
+    # Fresnel fringes at the rims, without air; coma, which terms that are not asked for are like, is known least.
+    assert error < min(25e-9, 0.5 * np.sqrt(np.trace(fit.covariance[0])))
 
 
 def test_strips_of_a_ring_are_its_transfer_function_to_first_order():
