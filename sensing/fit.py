@@ -173,9 +173,11 @@ def fit_donuts(
 
     with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
 
-        def alone(instrument: Instrument, i: int, begun: StarFit | None = None) -> StarFit:
+        def alone(
+            instrument: Instrument, i: int, begun: StarFit | None = None, *, preliminary: bool = False
+        ) -> StarFit:
             star, defocus, strength = observed.star(i), float(shifts[i]), float(strengths[i])
-            return _fit_alone(instrument, star, defocus, strength, fit.joint, begun)
+            return _fit_alone(instrument, star, defocus, strength, fit.joint, begun, preliminary)
 
         def fitted_stars(
             instrument: Instrument, star_fit: Callable[[int], StarFit], report: Callable[[int], None] | None = None
@@ -198,14 +200,18 @@ def fit_donuts(
 
         def first(i: int) -> StarFit:
             ready = by_rays.get(i)
-            return alone(instrument, i, ready) if ready is None or instrument.model.diffraction else ready
+            if ready is None or instrument.model.diffraction:
+                return alone(instrument, i, ready)
+            return alone(instrument, i, replace(ready, searched=True)) if ready.preliminary else ready
 
         def once_more(refined: Instrument) -> _Fitted:
             return fitted_stars(refined, lambda i: alone(refined, i, replace(fitted.stars[i], searched=True)))
 
         by_rays: dict[int, StarFit] = {}
         if model.diffraction is None:
-            by_rays, diffraction = _by_rays(instrument, partial(alone, instrument), len(observed), pool)
+            by_rays, diffraction = _by_rays(
+                instrument, partial(alone, instrument, preliminary=True), len(observed), pool
+            )
             model = replace(model, diffraction=diffraction)
             instrument = replace(instrument, model=model)
         fitted = fitted_stars(instrument, first, progress)
@@ -261,7 +267,13 @@ def _by_rays(
 
 
 def _fit_alone(
-    instrument: Instrument, star: ObservedStar, defocus: float, strength: float, joint: bool, begun: StarFit | None
+    instrument: Instrument,
+    star: ObservedStar,
+    defocus: float,
+    strength: float,
+    joint: bool,
+    begun: StarFit | None,
+    preliminary: bool,
 ) -> StarFit:
     """Fit one star by itself, from a fit of a simpler model if there is one, or say why not."""
     if np.hypot(*star.field) > instrument.telescope.field_limit * (1.0 + 1e-12):
@@ -275,7 +287,7 @@ def _fit_alone(
     saturated = _saturated(np.where(masked, 0.0, star.image), masked, instrument.model.detector.saturation)
     masked = masked | grown(saturated, ~masked)
     wavefront = not joint or light.diameter > SMALLEST_DONUT * instrument.pixel
-    fitted = _fit_with_noise(instrument, light, star, ~masked, strength, wavefront, begun)
+    fitted = _fit_with_noise(instrument, light, star, ~masked, strength, wavefront, begun, preliminary)
     if fitted.flags.usable:
         return replace(fitted, flags=fitted.flags | DonutFlag.CLIPPED) if (saturated | not_finite).any() else fitted
     if saturated.sum() > max(_SEVERAL * star.image.size, 1.0):
@@ -293,9 +305,10 @@ def _fit_with_noise(
     strength: float,
     wavefront: bool,
     begun: StarFit | None,
+    preliminary: bool,
 ) -> StarFit:
     """Fit the used pixels of one star with its known noise, or with noise and sky level that are measured."""
-    fit = partial(fit_star, instrument, light, strength=strength, wavefront=wavefront)
+    fit = partial(fit_star, instrument, light, strength=strength, wavefront=wavefront, preliminary=preliminary)
     image = np.where(used, star.image, 0.0)
     if star.known_noise:
         return fit(Pixels(image, star.variance, used), begun=begun)

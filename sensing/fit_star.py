@@ -68,6 +68,8 @@ class StarFit:
         Fits on both sides of focus.
     searched : bool
         Whether its search holds for a fit that begins from it, which has further Zernikes, or the rims of all stars.
+    preliminary : bool
+        Whether a fit that begins from it has to look for rims elsewhere in fine pixels.
     """
 
     flags: DonutFlag
@@ -76,6 +78,7 @@ class StarFit:
     level: float = 0.0
     sides: BothSides | None = None
     searched: bool = False
+    preliminary: bool = False
 
     @property
     def usable(self) -> StarSolution | None:
@@ -92,6 +95,7 @@ def fit_star(
     wavefront: bool,
     sky_level: float | None = None,
     begun: StarFit | None = None,
+    preliminary: bool = False,
 ) -> StarFit:
     """Fit one star.
 
@@ -109,6 +113,8 @@ def fit_star(
     begun : StarFit, optional
         Fit of a model without diffraction, or without some of the Zernikes, in the same unit, from which this one
         begins if its search left no question.
+    preliminary : bool
+        Whether rims elsewhere are left to a fit that begins from this one, unless they are plain in coarse pixels.
     """
     across = light.diameter / instrument.pixel
     donut = across > SMALLEST_DONUT
@@ -143,7 +149,7 @@ def fit_star(
         return StarFit(DonutFlag.NO_DONUT)
     if fitter.lost_light(start.stamp, best).any_pixel > _LOST:
         return StarFit(DonutFlag.MOSTLY_LOST)
-    return _finished(fitter, pixels, best, sides, sky_level, search.rivals)
+    return _finished(fitter, pixels, best, sides, sky_level, search.rivals, preliminary)
 
 
 def _holds(begun: StarFit, light: StarLight) -> bool:
@@ -210,10 +216,12 @@ def _finished(
     sides: BothSides | None,
     sky_level: float | None,
     rivals: tuple[RimFit, ...] = (),
+    preliminary: bool = False,
 ) -> StarFit:
     """Return the outcome of a fit of all pixels from the solution of a search and its rivals."""
-    flags = DonutFlag.OK
-    finest = fitter.finest(best, rivals)
+    flags, unit = DonutFlag.OK, 1.0
+    preliminary = preliminary and fitter.searches_rims
+    finest = fitter.finest(best, rivals, preliminary=preliminary)
     if (finest.full.used != pixels.used).any():
         flags |= DonutFlag.CLIPPED
     if any(body.moved for body in finest.light.free_rims.bodies):
@@ -232,8 +240,8 @@ def _finished(
     if sides is not None and sides.ambiguous:
         flags |= DonutFlag.AMBIGUOUS_SIDE
     if sky_level is not None and flags.usable:
-        return StarFit(flags, *fitter.with_measured_noise(finest, sky_level), sides=sides)
-    return StarFit(flags, finest, sides=sides)
+        finest, unit = fitter.with_measured_noise(finest, sky_level)
+    return StarFit(flags, finest, unit, sides=sides, preliminary=preliminary)
 
 
 @dataclass(frozen=True)

@@ -243,10 +243,10 @@ class StarFitter:
         """Return how many pixels are summed along each axis for the last fits in a seeing [rad]."""
         return self.instrument.binning(self._light, self.clean, fwhm) if self.donut else 1
 
-    def finest(self, coarse: Solution, rivals: tuple[RimFit, ...] = ()) -> StarSolution:
+    def finest(self, coarse: Solution, rivals: tuple[RimFit, ...] = (), *, preliminary: bool = False) -> StarSolution:
         """Return the best model in pixels as fine as the seeing needs, without those far off it.
 
-        Rivals are coarse fits of other rims that are as good.
+        Rivals are coarse fits of other rims that are as good. A preliminary model has the rims of the coarse one.
         """
         best, blended, fine = coarse, len(coarse.stars[0]) > RATIO, None
         # The seeing of a solution decides how finely the next one is sampled.
@@ -257,7 +257,7 @@ class StarFitter:
             steps = _SEEING_STEPS if finer.few_cells else STEPS
             fine, best = finer, self.solve(finer.stamp, best.stars[0], best.shared, steps=steps)
         assert fine is not None
-        if self.searches_rims:
+        if self.searches_rims and not preliminary:
             fit = RimFit(self._light, fine.stamp, best, rivals)
             fit = finished(self.instrument, fit, 0.0, self.rim_solver(FINE, fine.of))
             if fit.rivals and fine.sampling.across < _FOR_RIVALS:
