@@ -114,7 +114,7 @@ def fit_star(
         Fit of a model without diffraction, or without some of the Zernikes, in the same unit, from which this one
         begins if its search left no question.
     preliminary : bool
-        Whether rims elsewhere are left to a fit that begins from this one, unless they are plain in coarse pixels.
+        Whether rims elsewhere are left to a fit that begins from this one, unless coarse pixels tell them.
     """
     across = light.diameter / instrument.pixel
     donut = across > SMALLEST_DONUT
@@ -220,7 +220,7 @@ def _finished(
 ) -> StarFit:
     """Return the outcome of a fit of all pixels from the solution of a search and its rivals."""
     flags, unit = DonutFlag.OK, 1.0
-    preliminary = preliminary and fitter.searches_rims
+    preliminary = preliminary and fitter.searches_rims and not fitter.light.free_rims.bodies
     finest = fitter.finest(best, rivals, preliminary=preliminary)
     if (finest.full.used != pixels.used).any():
         flags |= DonutFlag.CLIPPED

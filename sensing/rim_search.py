@@ -20,7 +20,7 @@ from .solve import Solution
 #: Least gain of twice the logarithm of the likelihood by a rim elsewhere: noise makes one in 1e5 of three motions.
 _GAIN = 25.0
 #: What the model of a pixel is off by, over its light: rims explain some of it where photons are so many.
-_INEXACT = 2e-3
+_INEXACT = 1e-3
 #: Side of the squares whose residuals say how far noise is correlated [pixels].
 _SQUARE = 4
 #: Least number of such squares beyond that of the unknowns.

@@ -246,7 +246,7 @@ class StarFitter:
     def finest(self, coarse: Solution, rivals: tuple[RimFit, ...] = (), *, preliminary: bool = False) -> StarSolution:
         """Return the best model in pixels as fine as the seeing needs, without those far off it.
 
-        Rivals are coarse fits of other rims that are as good. A preliminary model has the rims of the coarse one.
+        Rivals are coarse fits of other rims that are as good. A preliminary model has no rims elsewhere.
         """
         best, blended, fine = coarse, len(coarse.stars[0]) > RATIO, None
         # The seeing of a solution decides how finely the next one is sampled.

@@ -169,7 +169,7 @@ def rotated_fit(focused, behind_focus):
     """A donut of a decentred M2, drawn with a turned camera and stored as LSST stores it, read back."""
     at = pachon.sensing.DonutFrames(rotator=np.deg2rad(25.0), stamp_axes="DVCS")
     believed = at.telescope(behind_focus)
-    true = believed.perturbed("M2", shift=(2e-4, -1e-4, 0.0))
+    true = believed.perturbed("M2", shift=(3e-4, -1.5e-4, 0.0))
     field = np.deg2rad([(0.6, 0.8)])
     stored = noisy(donut(true, field[0], flux=2e6), 300.0, 1).T
     fields = at.fields_of_telescope(at.fields_in(field, "DVCS"), "DVCS")
@@ -177,7 +177,7 @@ def rotated_fit(focused, behind_focus):
     fit = pachon.fit_donuts(
         believed, at.stamps([stored]), fields, 622e-9, sky_variance=300.0, noll=range(4, 12), model=model, threads=1
     )
-    designs = (behind_focus, behind_focus.perturbed("M2", shift=(2e-4, -1e-4, 0.0)))
+    designs = (behind_focus, behind_focus.perturbed("M2", shift=(3e-4, -1.5e-4, 0.0)))
     before, after = (pachon.wavefront_zernikes(t, field, 622e-9, jmax=22).coefficients[0] for t in designs)
     return at, fit, (after - before)[3:11]
 
@@ -185,7 +185,7 @@ def rotated_fit(focused, behind_focus):
 @pytest.mark.long
 def test_a_donut_of_a_turned_camera_is_read_back_from_dvcs(rotated_fit):
     _, fit, expected = rotated_fit
-    # Errors claimed are 21 nm each; transposed, the two comas (64 and -127 nm) would change places.
+    # Errors claimed are 27 nm each; transposed, the two comas (96 and -191 nm) would change places.
     assert np.abs((fit.zernikes[0] - expected) / fit.errors[0]).max() < 4.0
     assert abs(expected[3] - expected[4]) > 7.0 * fit.errors[0, 3:5].max()
 
