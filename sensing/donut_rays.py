@@ -331,9 +331,10 @@ class RimsOfCells:
             none = np.zeros((2, len(rims.points), 0))
             return RimsAt(*rims.landing(smooth, self._middle(landing)), none, none)
         if self._last is None or self._last[0] is not rims:
-            axes = [rims.landing(smooth, self._middle(axis)) for axis in self._response]
-            self._last = rims, *(np.stack(v) for v in zip(*axes, strict=True))
-        return RimsAt(*rims.landing(smooth, self._middle(landing)), *self._last[1:])
+            places, leans = zip(*(rims.landing(smooth, self._middle(axis)) for axis in self._response), strict=True)
+            self._last = rims, np.stack(places), np.stack(leans)
+        _, response, inward_response = self._last
+        return RimsAt(*rims.landing(smooth, self._middle(landing)), response, inward_response)
 
     def _middle(self, values: np.ndarray) -> np.ndarray:
         """Return values of all wavelengths at the middle one."""

@@ -85,7 +85,8 @@ def widened(vane: Simple, margin: float) -> Simple:
     """Return a vane that is wider, and longer if it has ends, by a margin [m]."""
     if isinstance(vane, Rectangle):
         return replace(vane, width=vane.width + margin, height=vane.height + margin)
-    return replace(vane, width=vane_width(vane) + margin)
+    assert isinstance(vane, Vane)
+    return replace(vane, width=vane.width + margin)
 
 
 def simple_regions(aperture: Aperture | None) -> list[Simple]:

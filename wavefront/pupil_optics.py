@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -71,12 +72,13 @@ class PupilOptics:
 
     def stars(self, index: slice | np.ndarray) -> PupilOptics:
         """Return the optics of some of the stars."""
-        return replace(self, **{name: getattr(self, name)[index] for name in _OF_STARS})
+        arrays: dict[str, Any] = {name: getattr(self, name)[index] for name in _OF_STARS}
+        return replace(self, **arrays)
 
     @classmethod
     def together(cls, parts: Sequence[PupilOptics]) -> PupilOptics:
         """Return the optics of the stars of all parts, of one pupil and the same wavelengths."""
-        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _OF_STARS}
+        arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _OF_STARS}
         return replace(parts[0], **arrays)
 
     @property

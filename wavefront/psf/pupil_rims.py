@@ -269,7 +269,7 @@ def pupil_rims(telescope: Telescope, direction: np.ndarray, wavelength: float, p
         edges = scanned_edges(telescope, direction, unit, wavelength)
         vanes = scanned_vanes(telescope, direction, edges, wavelength)
     reach = 0.5 * telescope.pupil_diameter
-    area, points, normals, parts, curvatures = 0.0, [], [], [], []
+    area, pieces_of_rims = 0.0, []
     for side, sign in ((0, 1.0), (1, -1.0)):
         rim = edges[:, side, None] * unit
         rim = points_of_plane(telescope, direction, wavelength, rim)
@@ -280,18 +280,16 @@ def pupil_rims(telescope: Telescope, direction: np.ndarray, wavelength: float, p
         # Where a spoke is dark its two ends are one point, and no light passes between them.
         shining = (edges[:, 1] > edges[:, 0]) & (length > 0.0)
         across = np.stack([along[:, 1], -along[:, 0]], axis=-1)[shining] / length[shining, None]
-        points.append(rim[shining])
-        normals.append(sign * across)
-        parts.append(length[shining])
         curved = sign * (along[:, 0] * bend[:, 1] - along[:, 1] * bend[:, 0])[shining] / length[shining] ** 3
         # Corners, where one rim begins to vignette, count as what curves most.
-        curvatures.append(np.clip(curved, -_MOST_CURVED / reach, _MOST_CURVED / reach))
-    points, normals, curvatures = (np.concatenate(v) for v in (points, normals, curvatures))
+        curved = np.clip(curved, -_MOST_CURVED / reach, _MOST_CURVED / reach)
+        pieces_of_rims.append((rim[shining], sign * across, length[shining], curved))
+    points, normals, lengths, curvatures = (np.concatenate(v) for v in zip(*pieces_of_rims, strict=True))
     area = max(area - float((vanes.lengths * vanes.widths).sum()), 1e-300)
     return PupilRims(
         np.concatenate([points, vanes.points]),
         np.concatenate([normals, vanes.normals]),
-        np.concatenate([*parts, vanes.lengths]) / area,
+        np.concatenate([lengths, vanes.lengths]) / area,
         np.concatenate([curvatures, np.zeros(len(vanes.points))]),
         vanes.widths,
         pieces,
