@@ -22,7 +22,7 @@ from ..raytrace.launch import aimed_points
 from ..raytrace.rays import RayStatus, parallel_rays
 from ..raytrace.trace import trace
 from ..wavefront.pupil_polynomials import PupilPolynomials
-from .rim_outlines import Simple, is_vane, simple_regions, widened
+from .rim_outlines import Simple, is_vane, simple_regions, vane_width, widened
 
 #: Side of the lattice over the diameter of the pupil: light off the axis may cross the plane of the stop just outside.
 _MARGIN = 1.02
@@ -33,8 +33,9 @@ _DIVISIONS = 3
 _CHORDS_OF_SMALL = 4
 _DIVISIONS_OF_SMALL = 2
 _SMALL = 120
-#: Nodes along each chord.
+#: Nodes along each chord, and most of them where vanes are narrower than their distance.
 _NODES = 5
+_MOST_NODES = 33
 #: Pieces that each division makes.
 _PARTS = 4
 #: Points along each side of the lattice whose light says where vanes stand on the pupil.
@@ -171,16 +172,20 @@ def pupil_cells(telescope: Telescope, direction: np.ndarray, wavelength: float, 
     differ = maximum_filter(status, 3, mode="constant") != minimum_filter(status, 3, mode="constant")
     quarters = (across, 2, across, 2)
     area, rim = status.reshape(quarters).mean(axis=(1, 3)), differ.reshape(quarters).any(axis=(1, 3))
+    crossed, narrowest = np.zeros_like(rim), math.inf
     if vanes:
-        rim |= _crossed(telescope, direction, wavelength, vanes, centers, side)
+        crossed, narrowest = _crossed(telescope, direction, wavelength, vanes, centers, side)
     moments = np.tile(side**2 / 12.0 * np.eye(2), (across, across, 1, 1))
-    if rim.any():
-        smooth = uniform_filter(area, 3, mode="constant")
-        down, across_rim = np.gradient(smooth)
-        upright = np.abs(down[rim]) > np.abs(across_rim[rim])
-        fineness = (_CHORDS_OF_SMALL, _DIVISIONS_OF_SMALL) if across > _SMALL else (_CHORDS, _DIVISIONS)
-        area[rim], offset, moments[rim] = _lit_parts(lit, centers[rim], side, upright, *fineness)
-        centers[rim] += offset
+    # Nodes no farther from each other than vanes are wide.
+    nodes_of_vanes = int(np.clip(math.ceil(side / narrowest) + 1, _NODES, _MOST_NODES))
+    smooth = uniform_filter(area, 3, mode="constant")
+    down, across_rim = np.gradient(smooth)
+    fineness = (_CHORDS_OF_SMALL, _DIVISIONS_OF_SMALL) if across > _SMALL else (_CHORDS, _DIVISIONS)
+    for cells, nodes in ((rim & ~crossed, _NODES), (crossed, nodes_of_vanes)):
+        if cells.any():
+            upright = np.abs(down[cells]) > np.abs(across_rim[cells])
+            area[cells], offset, moments[cells] = _lit_parts(lit, centers[cells], side, upright, nodes, *fineness)
+            centers[cells] += offset
     lit_cells = area > 0.0
     total = max(float(area.sum()), 1e-300)
     weights = area[lit_cells] / total
@@ -194,13 +199,16 @@ def _crossed(
     vanes: Mapping[int, Sequence[Simple]],
     centers: np.ndarray,
     side: float,
-) -> np.ndarray:
-    """Return which cells of a lattice of centres [n, n, 2] the shadows of vanes cross, by the numbers of surfaces."""
+) -> tuple[np.ndarray, float]:
+    """Return which cells of a lattice the shadows of vanes cross [n, n], and the width of the narrowest one [m].
+
+    Centres of the cells are of shape [n, n, 2]; vanes go by the numbers of their surfaces.
+    """
     places = centers.reshape(-1, 2)
     along = np.linspace(places[0], places[-1], _SURVEY)
     survey = np.stack(np.meshgrid(*along.T), axis=-1).reshape(-1, 2)
     ends = trace(telescope, parallel_rays(telescope, direction[None], wavelength, survey), "all", threads=1)
-    crossed = np.zeros(len(places), dtype=bool)
+    crossed, narrowest = np.zeros(len(places), dtype=bool), math.inf
     for surface, regions in vanes.items():
         landing = telescope.surfaces[surface].to_local(ends[surface].position)[:, :2]
         met = np.isfinite(landing).all(axis=1)
@@ -211,7 +219,8 @@ def _crossed(
         largest = float(np.linalg.svd(smooth.derivatives(landing[met]), compute_uv=False).max())
         for region in regions:
             crossed |= widened(region, math.sqrt(2.0) * side * largest).contains(x, y)
-    return crossed.reshape(centers.shape[:-1])
+            narrowest = min(narrowest, vane_width(region) / largest)
+    return crossed.reshape(centers.shape[:-1]), narrowest
 
 
 def _beam(telescope: Telescope, direction: np.ndarray, wavelength: float) -> tuple[np.ndarray, float]:
@@ -241,6 +250,7 @@ def _lit_parts(
     centers: np.ndarray,
     side: float,
     upright: np.ndarray,
+    nodes: int,
     chords: int,
     divisions: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -249,7 +259,7 @@ def _lit_parts(
     Chords run along x, or along y where ``upright``, across the rim. Rims on them are found between nodes of different
     status.
     """
-    node = side * np.linspace(-0.5, 0.5, _NODES)
+    node = side * np.linspace(-0.5, 0.5, nodes)
     row = side * ((np.arange(chords) + 0.5) / chords - 0.5)
 
     def places(along: np.ndarray, across: np.ndarray, cell: np.ndarray) -> np.ndarray:
@@ -258,9 +268,9 @@ def _lit_parts(
         return centers[cell].reshape(-1, *[1] * (offset.ndim - 2), 2) + np.where(turned, offset[..., ::-1], offset)
 
     indices = np.arange(len(centers))
-    across = np.broadcast_to(row[:, None], (len(centers), chords, _NODES))
+    across = np.broadcast_to(row[:, None], (len(centers), chords, nodes))
     status = lit(places(np.broadcast_to(node, across.shape), across, indices))
-    start, end = np.broadcast_to(node[:-1], (len(centers), chords, _NODES - 1)), node[1:]
+    start, end = np.broadcast_to(node[:-1], (len(centers), chords, nodes - 1)), node[1:]
     low, high = start * np.ones(1), end * np.ones(start.shape)
     cell, chord, piece = np.nonzero(status[:, :, 1:] != status[:, :, :-1])
     first, last, begins = node[piece], node[piece + 1], status[cell, chord, piece]
