@@ -38,17 +38,6 @@ class AmplifierStep:
     sizes: tuple[float, float] = (0.0, 0.0)
     errors: tuple[float, float] = (0.0, 0.0)
 
-    @property
-    def words(self) -> str:
-        """Place and sizes in words."""
-        names, units, scales = ("sky", "gain"), ("e", "%"), (1.0, 100.0)
-        sizes = [
-            f"{name} {scale * size:+.3g} +- {scale * error:.2g} {unit}"
-            for name, unit, scale, size, error in zip(names, units, scales, self.sizes, self.errors, strict=True)
-            if error
-        ]
-        return f"{'column' if self.axis else 'row'} {self.first}: {', '.join(sizes)}"
-
     def changed(self, kind: int, amplitude: float, error: float) -> AmplifierStep:
         """Return the same with more of a kind, sky (0) or gain (1), and its standard deviation."""
         sizes, errors = list(self.sizes), list(self.errors)
@@ -116,3 +105,17 @@ def step_table(steps: Mapping[int, Sequence[AmplifierStep]]) -> QTable:
         meaning = _MEANINGS[column.removesuffix("_err")]
         table[column].info.description = f"standard error of {column[:-4]}" if column.endswith("_err") else meaning
     return table
+
+
+def step_words(table: QTable) -> list[str]:
+    """Return what each row of a table of steps says, in words."""
+    words = []
+    for row in table:
+        place = f"donut {row['donut']}, {row['between'][:-1]} {row['first']}"
+        sizes = [
+            f"{name} {row[name].to_value(unit):+.3g} +- {row[name + '_err'].to_value(unit):.2g} {symbol}"
+            for name, unit, symbol in (("sky", u.electron / u.pix, "e"), ("gain", u.percent, "%"))
+            if row[f"{name}_err"] > 0.0
+        ]
+        words.append(f"{place}: {', '.join(sizes)}")
+    return words

@@ -414,7 +414,7 @@ def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> D
         for cause, covariances in parts.items():
             covariances[i] = getattr(star.errors, cause)
         model[i][middle], used[i][middle] = units[i] * star.model + levels[i], star.pixels.used
-        for step in _steps_of(fits.stars[i]):
+        for step in reversed(_steps_of(fits.stars[i])):
             model[i][:] = step.put_on(model[i], _light_level(fits.stars[i]))
         noise[i] = units[i] ** 2 * np.median(star.pixels.variance)
         chi2[i] = (pulls(star.pixels, star.model)[star.pixels.used] ** 2).sum()

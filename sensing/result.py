@@ -15,7 +15,7 @@ from ..core.units import arcseconds
 from ..design.drawing import field_colors
 from ..design.metrics.field_zernikes import name_terms
 from ..raytrace.rays import Projection
-from .amplifier_steps import step_table
+from .amplifier_steps import step_table, step_words
 from .degrees import FreedomEstimate
 from .exposure import ExposureWavefront
 from .flags import DonutFlag
@@ -321,6 +321,7 @@ class DonutFit(Result):
                 | {name: float(row[name].value) for name in ("pixels", "pixels_err")}
                 for row in self.rims
             ],
+            "amplifier_steps": step_words(self.amplifier_steps),
         }
         if self.double_zernikes is not None:
             out["double_zernike_nm"] = self.double_zernikes * 1e9
