@@ -45,6 +45,13 @@ class AmplifierStep:
         errors[kind] = error
         return replace(self, sizes=(sizes[0], sizes[1]), errors=(errors[0], errors[1]))
 
+    def without_chance(self, limit: float) -> AmplifierStep:
+        """Return the same without a kind of fewer standard deviations than a limit, but for the surer one."""
+        ratios = [abs(size) / error if error else 0.0 for size, error in zip(self.sizes, self.errors, strict=True)]
+        sky, gain = (float(ratio >= min(limit, max(ratios))) for ratio in ratios)
+        sizes, errors = ((sky * of_sky, gain * of_gain) for of_sky, of_gain in (self.sizes, self.errors))
+        return replace(self, sizes=sizes, errors=errors)
+
     def beyond(self, shape: tuple[int, ...]) -> np.ndarray:
         """Return 1 at the columns or rows of a stamp from the step on, else 0, of its shape but across the step."""
         from_there = np.arange(shape[self.axis]) >= self.first

@@ -13,6 +13,7 @@ then taken off the image, and the fit goes on. The unknowns have the further cov
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -22,8 +23,9 @@ from .amplifier_steps import AmplifierStep, StepFit
 from .likelihood import linearized
 from .star_fitter import StarSolution
 
-#: Amplitude of a step over its standard deviation from which on it is real: chance reaches 4 somewhere on a stamp.
-_SIGNIFICANT = 6.0
+#: Amplitude of a step over its standard deviation from which on it is real: 180 donuts without any, with other defects,
+#: reach 4.7 somewhere.
+_SIGNIFICANT = 5.5
 #: The same of a step of the gain where the sky has one, or the reverse.
 _BESIDE = 4.0
 #: Columns or rows with used pixels on each side of a step, at least.
@@ -41,18 +43,20 @@ def fit_steps(star: StarSolution, known: Sequence[AmplifierStep]) -> StepFit | N
     scores = _Scores.of(star)
     if scores is None or not (known or scores.standing_out()):
         return None
-    patterns = [_Pattern(s.axis, s.first, kind) for s in known for kind in (0, 1) if s.errors[kind] > 0.0]
+    kept = [step.without_chance(_BESIDE) for step in known]
+    patterns = [_Pattern(step.axis, step.first, kind) for step in kept for kind in (0, 1) if step.errors[kind]]
     if len(known) < _MOST:
         patterns += scores.without(patterns).standing_out()
     if not patterns:
         return None
     amplitudes, variances, moved = scores.amplitudes(patterns)
     deviations = np.sqrt(np.diag(variances))
-    steps = {(step.axis, step.first): step for step in known}
+    steps = {(step.axis, step.first): step for step in kept}
     for pattern, amplitude, deviation in zip(patterns, amplitudes, deviations, strict=True):
         place = pattern.axis, pattern.first
         steps[place] = steps.get(place, AmplifierStep(*place)).changed(pattern.kind, float(amplitude), float(deviation))
-    return StepFit(tuple(steps.values()), float(np.abs(amplitudes / deviations).max()), moved @ variances @ moved.T)
+    change = float(np.abs(amplitudes / deviations).max()) if kept == list(known) else math.inf
+    return StepFit(tuple(steps.values()), change, moved @ variances @ moved.T)
 
 
 @dataclass(frozen=True)
