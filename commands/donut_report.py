@@ -150,6 +150,7 @@ def _unit(converted: ObservatoryZernikes) -> tuple[float, str, str]:
 
 def _remarks(fit: DonutFit) -> list[str]:
     """Return what is to be said of all donuts together, in sentences."""
+    from ..sensing.amplifier_steps import step_words
     from ..sensing.flags import DonutFlag
 
     remarks, exposure = [], fit.exposure
@@ -165,6 +166,8 @@ def _remarks(fit: DonutFit) -> list[str]:
         remarks.append(
             f"{ambiguous} of {len(fit)} donuts fit both sides of focus: results are those of the side given."
         )
+    if len(fit.amplifier_steps):
+        remarks.append(f"Steps between amplifiers were fitted too: {'; '.join(step_words(fit.amplifier_steps))}.")
     if exposure is not None:
         remarks.append(
             f"{int(fit.usable.sum())} donuts are fitted as of one telescope (--each-alone: each by itself). By their "

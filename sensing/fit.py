@@ -18,6 +18,7 @@ from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ..models.telescope import Telescope
 from ..raytrace.rays import Projection
 from ..wavefront.psf.light import Light
+from .amplifier_steps import AmplifierStep, step_table
 from .bad_pixels import grown
 from .fit_star import StarFit, fit_star
 from .flags import DonutFlag
@@ -48,6 +49,7 @@ from .shared_rims import contradicted
 from .stamps import Pixels, central_slices
 from .star_errors import ErrorParts
 from .star_fitter import SMALLEST_DONUT, StarSolution
+from .step_search import fit_steps
 from .wavefront_fits import NOLL, FittedStars, SingleDonuts, UsableStars, WavefrontFit
 
 #: Pixels, as a fraction of the stamp, from which on those of one greatest value are saturated, and saturated ones the
@@ -65,6 +67,10 @@ _BY_CHANCE = 5.0
 _NOISE_AGREES = 2.0
 #: Most fits of a star whose noise is measured.
 _NOISE_FITS = 2
+#: Most fits of a star with steps between amplifiers, and change of their amplitudes over their standard deviations
+#: below which these hold.
+_STEP_FITS = 4
+_SETTLED = 0.3
 
 
 @removed_arguments(
@@ -286,8 +292,18 @@ def _fit_alone(
     masked = star.masked | not_finite
     saturated = _saturated(np.where(masked, 0.0, star.image), masked, instrument.model.detector.saturation)
     masked = masked | grown(saturated, ~masked)
-    wavefront = not joint or light.diameter > SMALLEST_DONUT * instrument.pixel
-    fitted = _fit_with_noise(instrument, light, star, ~masked, strength, wavefront, begun, preliminary)
+    donut = light.diameter > SMALLEST_DONUT * instrument.pixel
+    wavefront = not joint or donut
+    fitted_once = partial(
+        _fit_with_noise,
+        instrument,
+        light,
+        used=~masked,
+        strength=strength,
+        wavefront=wavefront,
+        preliminary=preliminary,
+    )
+    fitted = _fit_with_steps(fitted_once, star, begun, wavefront and donut)
     if fitted.flags.usable:
         return replace(fitted, flags=fitted.flags | DonutFlag.CLIPPED) if (saturated | not_finite).any() else fitted
     if saturated.sum() > max(_SEVERAL * star.image.size, 1.0):
@@ -297,14 +313,37 @@ def _fit_alone(
     return fitted
 
 
+def _fit_with_steps(fit: Callable[..., StarFit], star: ObservedStar, begun: StarFit | None, searched: bool) -> StarFit:
+    """Fit one star, and again without steps between amplifiers where its residuals have any."""
+    steps = _steps_of(begun)
+    # They are no part of the search that another begins from.
+    before = None if begun is None else replace(begun, flags=begun.flags & ~DonutFlag.AMPLIFIER_STEP)
+    for _ in range(_STEP_FITS):
+        fitted = fit(_without_steps(star, steps, before), before)
+        usable = fitted.usable
+        if usable is None or not searched:
+            break
+        middle = central_slices(star.image.shape, usable.full.image.shape)
+        found = fit_steps(usable, [step.within(middle, fitted.unit) for step in steps])
+        if found is None:
+            break
+        steps = tuple(step.around(middle, fitted.unit) for step in found.steps)
+        found, before = replace(found, steps=steps), fitted
+        fitted = replace(fitted, flags=fitted.flags | DonutFlag.AMPLIFIER_STEP, best=replace(usable, steps=found))
+        if found.change < _SETTLED:
+            break
+    return fitted
+
+
 def _fit_with_noise(
     instrument: Instrument,
     light: StarLight,
     star: ObservedStar,
+    begun: StarFit | None,
+    *,
     used: np.ndarray,
     strength: float,
     wavefront: bool,
-    begun: StarFit | None,
     preliminary: bool,
 ) -> StarFit:
     """Fit the used pixels of one star with its known noise, or with noise and sky level that are measured."""
@@ -328,6 +367,26 @@ def _fit_with_noise(
         noise = replace(noise, sky=noise.sky * fitted.unit, photon=unit * fitted.unit)
         begun = None
     return replace(fitted, unit=unit * fitted.unit, level=level)
+
+
+def _steps_of(fitted: StarFit | None) -> tuple[AmplifierStep, ...]:
+    """Return the steps between amplifiers on the stamp of a fit."""
+    usable = None if fitted is None else fitted.usable
+    return () if usable is None or usable.steps is None else usable.steps.steps
+
+
+def _light_level(fitted: StarFit) -> float:
+    """Return the level of a stamp above which there is light of the star by its fit [units of the image]."""
+    usable = fitted.usable
+    return fitted.level + (0.0 if usable is None else fitted.unit * float(usable.solution.stars[0][BACKGROUND]))
+
+
+def _without_steps(star: ObservedStar, steps: Sequence[AmplifierStep], fitted: StarFit | None) -> ObservedStar:
+    """Return a star without steps between amplifiers, by a fit that has its level."""
+    for step in steps:
+        assert fitted is not None
+        star = replace(star, image=step.taken_off(star.image, _light_level(fitted)))
+    return star
 
 
 def _saturated(image: np.ndarray, masked: np.ndarray, level: float | None) -> np.ndarray:
@@ -377,6 +436,8 @@ def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> D
         for cause, covariances in parts.items():
             covariances[i] = getattr(star.errors, cause)
         model[i][middle], used[i][middle] = units[i] * star.model + levels[i], star.pixels.used
+        for step in reversed(_steps_of(fits.stars[i])):
+            model[i][:] = step.put_on(model[i], _light_level(fits.stars[i]))
         noise[i] = units[i] ** 2 * np.median(star.pixels.variance)
         chi2[i] = (pulls(star.pixels, star.model)[star.pixels.used] ** 2).sum()
         n_pixels[i] = star.pixels.used.sum()
@@ -429,5 +490,6 @@ def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> D
         projection=observed.projection,
         diffraction=bool(instrument.model.diffraction),
         rims=rim_table(rims),
+        amplifier_steps=step_table({int(i): _steps_of(fits.stars[i]) for i in usable}),
         exposure=None if fitted.exposure is None else fitted.exposure.at(usable, count),
     )

@@ -8,13 +8,14 @@ from enum import IntFlag
 class DonutFlag(IntFlag):
     """Outcome of the fit of one donut; zero for a clean one.
 
-    Seven flags are remarks: the results hold. ``BLENDED``: neighbours were fitted too. ``CLIPPED``: pixels far off the
+    Eight flags are remarks: the results hold. ``BLENDED``: neighbours were fitted too. ``CLIPPED``: pixels far off the
     model, not finite or saturated were left out, cosmic rays for example. ``CUT_OFF``: a twentieth of the light or more
     falls beside the stamp or on regions of it that are not used; errors are those of what remains. ``POOR_FIT``:
     chi-square is far above the number of pixels, and errors have what the residuals say. ``OTHER_SIZE``: the donut is
     larger or smaller than that of the telescope by more than 8 %, as with another defocus or pixel size. ``RIM_MOVED``:
     a rim or a spider stands elsewhere than the prescription has it, and was fitted too. ``ORIENTATION``: stamps of the
-    exposure fit better as mirror images, or turned by quarters (set by the command).
+    exposure fit better as mirror images, or turned by quarters (set by the command). ``AMPLIFIER_STEP``: sky or gain
+    change along a column or row, as where two amplifiers meet, and were fitted too.
 
     So is ``AMBIGUOUS_SIDE``: the image fits as well on the other side of focus, with another wavefront; results are
     those of the side that is given.
@@ -45,6 +46,7 @@ class DonutFlag(IntFlag):
     AMBIGUOUS_SIDE = 16384
     MOSTLY_LOST = 32768
     ORIENTATION = 65536
+    AMPLIFIER_STEP = 131072
 
     @property
     def usable(self) -> bool:
@@ -67,4 +69,5 @@ _REMARKS = (
     | DonutFlag.RIM_MOVED
     | DonutFlag.AMBIGUOUS_SIDE
     | DonutFlag.ORIENTATION
+    | DonutFlag.AMPLIFIER_STEP
 )

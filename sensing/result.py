@@ -15,6 +15,7 @@ from ..core.units import arcseconds
 from ..design.drawing import field_colors
 from ..design.metrics.field_zernikes import name_terms
 from ..raytrace.rays import Projection
+from .amplifier_steps import step_table, step_words
 from .degrees import FreedomEstimate
 from .exposure import ExposureWavefront
 from .flags import DonutFlag
@@ -134,6 +135,8 @@ class DonutFit(Result):
         Rims and spiders that stand elsewhere than the prescription has them, one a row: number of the donut, surfaces,
         shift towards more light on the surface and on the image, and motions, with errors. Of joint fits, those of each
         donut by itself.
+    amplifier_steps : QTable
+        Steps of sky and gain along columns and rows that were fitted too, one a row, with errors.
     diffraction : bool
         Whether the model has light diffracted at the rims of the pupil.
     exposure : ExposureWavefront or None
@@ -173,6 +176,7 @@ class DonutFit(Result):
     degrees_of_freedom: FreedomEstimate | None = None
     projection: Projection = "zemax"
     rims: QTable = field(default_factory=lambda: rim_table({}))
+    amplifier_steps: QTable = field(default_factory=lambda: step_table({}))
     diffraction: bool = False
     exposure: ExposureWavefront | None = None
 
@@ -317,6 +321,7 @@ class DonutFit(Result):
                 | {name: float(row[name].value) for name in ("pixels", "pixels_err")}
                 for row in self.rims
             ],
+            "amplifier_steps": step_words(self.amplifier_steps),
         }
         if self.double_zernikes is not None:
             out["double_zernike_nm"] = self.double_zernikes * 1e9

@@ -136,7 +136,11 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
             lacking, air = lacking + speckles[:n_star, :n_star], air + turbulence[wavefront, wavefront]
             speckled = speckles[wavefront, wavefront]
     accuracy, of_residuals = model_floor(solution.shared[:n]), residuals[wavefront, wavefront] + by_rivals(star, n)
-    parts = ErrorParts.of(photons[wavefront, wavefront], of_residuals, air, figure + accuracy)
+    of_noise = photons[wavefront, wavefront]
+    if star.steps is not None:
+        lacking += star.steps.covariance[:n_star, :n_star]
+        of_noise = of_noise + star.steps.covariance[wavefront, wavefront]
+    parts = ErrorParts.of(of_noise, of_residuals, air, figure + accuracy)
     of_light = parts.photons - by_prior + parts.residuals + speckled
     return StarErrors(lacking, parts, of_light, figure + by_prior + accuracy)
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..core.statistics import RMS_PER_MAD
+from .amplifier_steps import StepFit
 from .bad_pixels import unused_regions, without_outliers
 from .donut_rays import ZernikeRays
 from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y, STRENGTH, X, Y
@@ -82,6 +83,8 @@ class StarSolution:
         Errors of the fit by itself, of :mod:`.star_errors`, where they are at hand.
     rivals : tuple of Rival
         Fits with other rims free that are no worse but by chance.
+    steps : StepFit, optional
+        Steps between amplifiers that were taken off the image, of :mod:`.step_search`, where there are any.
     """
 
     light: StarLight
@@ -91,6 +94,7 @@ class StarSolution:
     model: np.ndarray
     errors: object = None
     rivals: tuple[Rival, ...] = ()
+    steps: StepFit | None = None
 
 
 @dataclass(frozen=True)
