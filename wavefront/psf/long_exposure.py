@@ -401,6 +401,7 @@ class LongExposureRenderer(PsfRenderer):
                 warp_array(channels.of_wavelength(channels.shift), wp.float64),
                 self.period,
                 warp_array(self._clear_area(edges), wp.float64),
+                wp.empty((n_star, pupil.n_spoke, len(pupil.radius), n_wave), dtype=wp.vec4d, device="cpu"),
                 *points,
             ],
             threads=self._threads,
