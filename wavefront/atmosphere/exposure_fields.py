@@ -42,10 +42,15 @@ _SPOKES = 20
 _FIRST_RING = 0.3
 #: Side of the grid of a layer over the outer scale or the pupil, at least: longer modes are left out.
 _LAYER_SIDE = 8.0
-#: Largest frequency of Zernikes times the diameter of the pupil, and samples of their tables: beyond it Z4 to Z10 have
-#: 1 % of their variance, Z11, the smallest, a seventh to a fifth.
-_HIGHEST = 4.0
-_TABLE = 2048
+#: Largest frequency of the mean wavefront times the diameter of the pupil, and that of tables, from zero in so many
+#: steps. Beyond the first Z4 to Z10 have 1 % of their variance, Z11, the smallest, a quarter: the modes below, which
+#: are longer, are that much stronger.
+_HIGHEST = 2.0
+_LAST = 16.0
+_TABLE = 8192
+#: Samples of these fields in the same angle: two a mode.
+_WAVEFRONT_SAMPLES = 2.0 * _HIGHEST
+_KEPT = int(_TABLE * _HIGHEST / _LAST)
 #: Factor of modes without frequency along x, and with the highest one: the inverse transform takes the mean of those at
 #: a frequency along y and at its opposite.
 _BOTH_SIGNS = np.float32(math.sqrt(2.0))
@@ -242,7 +247,7 @@ def _ground_factor(air: ExposedAir) -> np.ndarray:
 def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int, epoch: int) -> SplineFields:
     """Draw the fields of some layers on a common grid of a side [rad]."""
     distance = np.array([air.altitudes[n] for n in layers])
-    size = _grid_size(_SAMPLES * side * distance.max() / air.diameter)
+    size = _grid_size(_WAVEFRONT_SAMPLES * side * distance.max() / air.diameter)
     # Of each layer only modes that its Zernikes have.
     reach = np.minimum(np.ceil(_HIGHEST * side * distance / air.diameter).astype(int), size // 2 - 1)
     noise = [
@@ -253,9 +258,11 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
     scale = 1e6 * math.sqrt(float(path_spectrum(0.0, air.r0, air.outer_scale)) * air.outer_scale ** (-11.0 / 3.0))
     weights = np.array([air.weights[n] for n in layers])
     drift = air.exposure * np.array([air.velocities[n] for n in layers])
-    nu = np.linspace(0.0, _HIGHEST / air.diameter, _TABLE)
+    nu = np.linspace(0.0, _LAST / air.diameter, _TABLE + 1)
     root = (nu**2 + air.outer_scale**-2) ** (-11.0 / 12.0)
-    radial = np.array([root * radial_transform(j, _HIGHEST, _TABLE, air.obscuration) for j in NOLL])
+    radial = root[:, None] * np.stack([radial_transform(j, _LAST, _TABLE + 1, air.obscuration) for j in NOLL], axis=1)
+    amplitude = scale * size * np.sqrt(weights) / (distance * side)
+    strength = amplitude[:, None] * _compensation(nu, radial**2, np.hypot(*drift.T))
     spectrum = np.empty((len(NOLL), size, size // 2 + 1), dtype=np.complex64)
     launch(
         add_wavefronts,
@@ -266,10 +273,10 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
             warp_array(reach, wp.int32),
             warp_array(distance, wp.float32),
             warp_array(drift, wp.float32),
-            warp_array(scale * size * np.sqrt(weights) / (distance * side), wp.float32),
+            warp_array(strength, zernikes),
             1.0 / side,
-            warp_array(radial.T, zernikes),
-            air.diameter * (_TABLE - 1) / _HIGHEST,
+            warp_array(radial[: _KEPT + 2], zernikes),
+            air.diameter * _TABLE / _LAST,
             warp_array([noll_to_nm(j)[1] for j in NOLL], wp.int32),
             warp_array(_spline_gain(size), wp.float32),
             1e-6,
@@ -277,3 +284,13 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
         ],
     )
     return SplineFields(side, _fields(spectrum))
+
+
+def _compensation(frequency: np.ndarray, power: np.ndarray, drift: np.ndarray) -> np.ndarray:
+    """Return factors of the amplitudes of layers that make up for modes that are left out, [n_layer, n_noll].
+
+    ``power`` [n_frequency, n_noll] is that of Zernikes at frequencies [1/m]; ``drift`` [n_layer] is in the exposure [m].
+    """
+    # The mean over directions of the smear sinc^2 by the wind, whose lobe is that narrow.
+    ring = frequency / (1.0 + math.pi * frequency * drift[:, None])
+    return np.sqrt((ring @ power) / (ring[:, :_KEPT] @ power[:_KEPT]))
