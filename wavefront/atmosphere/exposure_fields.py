@@ -48,9 +48,11 @@ _LAYER_SIDE = 8.0
 _HIGHEST = 2.0
 _LAST = 16.0
 _TABLE = 8192
-#: Samples of these fields in the same angle: two a mode.
-_WAVEFRONT_SAMPLES = 2.0 * _HIGHEST
-_KEPT = int(_TABLE * _HIGHEST / _LAST)
+#: Samples of these fields in the angle of the pupil at their highest layer: more than two a mode, which splines would
+#: weaken by a half.
+_WAVEFRONT_SAMPLES = 5.0
+#: Steps of the tables up to the modes that are drawn.
+_DRAWN = round(_TABLE * _HIGHEST / _LAST)
 #: Factor of modes without frequency along x, and with the highest one: the inverse transform takes the mean of those at
 #: a frequency along y and at its opposite.
 _BOTH_SIGNS = np.float32(math.sqrt(2.0))
@@ -67,8 +69,7 @@ class FieldGrid(NamedTuple):
         """Return that for the moments over a field of a radius [rad]."""
         side = 2.0 * _MARGIN * field_radius
         highest = max(air.altitudes, default=0.0)
-        wanted = _SAMPLES * side * highest / air.diameter
-        return cls(_grid_size(wanted), side)
+        return cls(_grid_size(side * highest / air.diameter, _SAMPLES), side)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,14 +212,14 @@ def _spline_gain(size: int) -> np.ndarray:
     return stencil_gain(2.0 * np.pi * np.fft.fftfreq(size), np.zeros(()), "spline").astype(np.float32)
 
 
-def _grid_size(wanted: float) -> int:
-    """Return an even number of samples with quick transforms; DomainError if they are too many."""
-    if wanted > _MOST_SAMPLES:
+def _grid_size(pupils: float, samples: float) -> int:
+    """Return an even number of samples with quick transforms, at least so many a pupil; DomainError if too many."""
+    if samples * pupils > _MOST_SAMPLES:
         raise DomainError(
-            f"engine = 'statistical': the field under the highest layer is {wanted / _SAMPLES:.0f} pupils wide; "
-            f"expected at most {_MOST_SAMPLES / _SAMPLES:.0f} ('fast' has no such limit)"
+            f"engine = 'statistical': the field under the highest layer is {pupils:.0f} pupils wide; "
+            f"expected at most {_MOST_SAMPLES / samples:.0f} ('fast' has no such limit)"
         )
-    count = max(math.ceil(wanted), _LEAST_SAMPLES)
+    count = max(math.ceil(samples * pupils), _LEAST_SAMPLES)
     return 2 * int(scipy.fft.next_fast_len(-(-count // 2), real=True))
 
 
@@ -247,7 +248,7 @@ def _ground_factor(air: ExposedAir) -> np.ndarray:
 def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int, epoch: int) -> SplineFields:
     """Draw the fields of some layers on a common grid of a side [rad]."""
     distance = np.array([air.altitudes[n] for n in layers])
-    size = _grid_size(_WAVEFRONT_SAMPLES * side * distance.max() / air.diameter)
+    size = _grid_size(side * distance.max() / air.diameter, _WAVEFRONT_SAMPLES)
     # Of each layer only modes that its Zernikes have.
     reach = np.minimum(np.ceil(_HIGHEST * side * distance / air.diameter).astype(int), size // 2 - 1)
     noise = [
@@ -275,7 +276,7 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
             warp_array(drift, wp.float32),
             warp_array(strength, zernikes),
             1.0 / side,
-            warp_array(radial[: _KEPT + 2], zernikes),
+            warp_array(radial[: _DRAWN + 2], zernikes),
             air.diameter * _TABLE / _LAST,
             warp_array([noll_to_nm(j)[1] for j in NOLL], wp.int32),
             warp_array(_spline_gain(size), wp.float32),
@@ -289,8 +290,9 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
 def _compensation(frequency: np.ndarray, power: np.ndarray, drift: np.ndarray) -> np.ndarray:
     """Return factors of the amplitudes of layers that make up for modes that are left out, [n_layer, n_noll].
 
-    ``power`` [n_frequency, n_noll] is that of Zernikes at frequencies [1/m]; ``drift`` [n_layer] is in the exposure [m].
+    ``power`` [n_frequency, n_noll] is that of Zernikes at frequencies [1/m]; ``drift`` [n_layer] that in the exposure
+    [m].
     """
     # The mean over directions of the smear sinc^2 by the wind, whose lobe is that narrow.
     ring = frequency / (1.0 + math.pi * frequency * drift[:, None])
-    return np.sqrt((ring @ power) / (ring[:, :_KEPT] @ power[:_KEPT]))
+    return np.sqrt((ring @ power) / (ring[:, :_DRAWN] @ power[:_DRAWN]))

@@ -165,7 +165,7 @@ def add_wavefronts(
 
     Arguments: noise: transforms of white noise, from start [layer] on those of a layer, rows -reach to reach and
     columns 0 to reach [layer]; distance [layer] along the line of sight [m]; drift [layer, 2] in the exposure [m];
-    strength [layer]: amplitude of a mode of each term, but for the power of its frequency; frequency_step of the field [cycles/rad];
+    strength [layer]: amplitudes of a mode but for the power of its frequency; frequency_step of the field [cycles/rad];
     radial [k]: mean over the pupil of a term's radial part times a wave, with the root of the power of the frequency,
     against the frequency, whose table has per_frequency steps a cycle/m; order [term] m of the Zernikes, -3 to 3,
     negative for sines; gain [row] of splines along either axis; unit of the strength in that of the results; spectrum

@@ -82,10 +82,17 @@ def test_mean_wavefronts_have_their_covariances(altitudes, side):
     sigma = np.sqrt(np.diag(theory[0, :, 0]))
     scale = np.outer(sigma, sigma)
     # 750 m of a layer, 8 m across and 50 m along the wind for each independent patch: some 1400, three standard errors;
-    # of the low one 400 m. Z11 lacks a seventh of its variance.
+    # of the low one 400 m. Modes that are left out are made up for by longer ones.
     bound = 0.12 * 750.0 / (side * altitude)
     assert here.T @ here / len(stars) / scale == pytest.approx(theory[0, :, 0] / scale, abs=bound)
     assert here.T @ there / len(stars) / scale == pytest.approx(theory[0, :, 1] / scale, abs=bound)
+
+
+def test_longer_modes_make_up_for_those_left_out():
+    """Of one power at all frequencies up to 1, drawn to 1/8: areas of discs, and lengths of a lobe across the wind."""
+    frequency = np.linspace(0.0, 1.0, 8193)
+    factors = exposure_fields._compensation(frequency, np.ones((8193, 1)), np.array([0.0, 1e9]))
+    assert factors[:, 0] == pytest.approx([8.0, math.sqrt(8.0)], rel=1e-3)
 
 
 def test_ground_layer_is_the_same_for_all_stars():
