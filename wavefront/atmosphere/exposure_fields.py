@@ -31,8 +31,10 @@ from .turbulence import path_spectrum
 NOLL = range(4, 12)
 #: Side of the periodic grids over the diameter of the field.
 _MARGIN = 1.5
-#: Samples in the angle under which the highest layer crosses the pupil, at least, and most samples on a side.
-_SAMPLES = 6.0
+#: Samples in the angle under which the highest layer crosses the pupil, at least. Half-variograms of the LSST's moments
+#: from 0.5 arcmin on are those of the theory within 6 %, from 1 arcmin on within 2 %; with 3 they lack 15 % at 0.5.
+_SAMPLES = 4.5
+#: Most samples on a side.
 _MOST_SAMPLES = 2048
 _LEAST_SAMPLES = 16
 #: Rings and spokes of lags, between which covariances are interpolated.
