@@ -70,9 +70,9 @@ _NEAR = 0
 # Bytes of a point of the lattice and a wavelength.
 _LATTICE_BYTES = 24
 # Most stars of one batch.
-_BATCH = 256
+_BATCH = 1024
 # Largest memory of the waves of a batch [bytes], which then has fewer stars.
-_BATCH_BYTES = 1 << 25
+_BATCH_BYTES = 1 << 26
 # Samples of the filter against the baseline: linear interpolation is then good to 1e-6.
 _TABLE_SIZE = 2048
 
