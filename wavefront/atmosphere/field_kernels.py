@@ -152,7 +152,7 @@ def add_wavefronts(
     reach: wp.array(dtype=wp.int32),
     distance: wp.array(dtype=wp.float32),
     drift: wp.array2d(dtype=wp.float32),
-    strength: wp.array(dtype=wp.float32),
+    strength: wp.array(dtype=zernikes),
     frequency_step: wp.float32,
     radial: wp.array(dtype=zernikes),
     per_frequency: wp.float32,
@@ -165,7 +165,7 @@ def add_wavefronts(
 
     Arguments: noise: transforms of white noise, from start [layer] on those of a layer, rows -reach to reach and
     columns 0 to reach [layer]; distance [layer] along the line of sight [m]; drift [layer, 2] in the exposure [m];
-    strength [layer]: amplitude of a mode but for the power of its frequency; frequency_step of the field [cycles/rad];
+    strength [layer]: amplitudes of a mode but for the power of its frequency; frequency_step of the field [cycles/rad];
     radial [k]: mean over the pupil of a term's radial part times a wave, with the root of the power of the frequency,
     against the frequency, whose table has per_frequency steps a cycle/m; order [term] m of the Zernikes, -3 to 3,
     negative for sines; gain [row] of splines along either axis; unit of the strength in that of the results; spectrum
@@ -185,16 +185,17 @@ def add_wavefronts(
             for layer in range(distance.shape[0]):
                 at = length / distance[layer] * per_frequency
                 bound = reach[layer]
-                if at < last and column <= bound and wp.abs(signed) <= bound:
+                if at < last and column * column + signed * signed <= bound * bound:
                     nu_x = across / distance[layer]
                     nu_y = up / distance[layer]
                     turns = wp.float32(wp.PI) * (nu_x * drift[layer, 0] + nu_y * drift[layer, 1])
                     smear = wp.float32(1.0)
                     if wp.abs(turns) > wp.float32(1e-3):
                         smear = wp.sin(turns) / turns
-                    mode = strength[layer] * smear * noise[start[layer] + (signed + bound) * (bound + 1) + column]
+                    mode = smear * noise[start[layer] + (signed + bound) * (bound + 1) + column]
                     knot = wp.int32(at)
                     transform = radial[knot] + (at - wp.float32(knot)) * (radial[knot + 1] - radial[knot])
+                    transform = wp.cw_mul(strength[layer], transform)
                     re = re + mode[0] * transform
                     im = im + mode[1] * transform
             angles = multiple_angles(wp.vec2f(across / length, up / length))

@@ -160,6 +160,15 @@ class PsfRenderer(ABC):
     def prepare(self, fields: np.ndarray) -> None:  # noqa: B027 - most engines need nothing
         """Prepare what stars at field angles [n_star, 2] [rad] have in common, before the first batch."""
 
+    def batches(self, fields: np.ndarray) -> list[np.ndarray]:
+        """Return indices of the stars at field angles [n_star, 2] [rad] that each batch holds."""
+        order = self._order(fields)
+        return [order[first : first + self.batch] for first in range(0, len(order), self.batch)]
+
+    def _order(self, fields: np.ndarray) -> np.ndarray:
+        """Return indices of stars in the order in which they are rendered, [n_star]."""
+        return np.arange(len(fields))
+
     def render(
         self,
         fields: np.ndarray,

@@ -12,42 +12,75 @@ from .spoke_sums import add_inner_points, add_rims, lay_waves
 
 wp.set_module_options(FORWARD_OPTIONS)
 
-ring_values = wp.types.vector(MOST_RINGS, wp.float64)
+# Packets of eight rings.
+MOST_PACKETS = -(-MOST_RINGS // 8)
+
+# In C with vectors of the compiler, over the polynomials of the rings.
+_SPOKE_LOOP = f"""
+    const int n_ring = radius.shape[0], n_wave = displacement.shape[0];
+    typedef double packet __attribute__((vector_size(64), aligned(8)));
+    typedef long long lanes __attribute__((vector_size(64), aligned(8)));
+    const int n_packet = (n_ring + 7) / 8;
+    packet scale[{MOST_PACKETS}], values[{MOST_PACKETS}], slopes[{MOST_PACKETS}];
+    lanes number = {{0, 1, 2, 3, 4, 5, 6, 7}};
+    for (int p = 0; p < n_packet; ++p)
+        for (int i = 0; i < 8; ++i) {{
+            const int k = 8 * p + i;
+            double product = k < n_ring ? landed.data[k * n_spoke + spoke] : 0.0;
+            for (int ring = 0; ring < n_ring; ++ring)
+                if (product != 0.0 && ring != k && landed.data[ring * n_spoke + spoke] > 0.0)
+                    product *= inverse.data[k * n_ring + ring];
+            scale[p][i] = product;
+        }}
+    for (int ring = 0; ring < n_ring; ++ring) {{
+        const double at = __builtin_sqrt(start + span * fraction.data[ring]);
+        for (int p = 0; p < n_packet; ++p) {{
+            packet value = scale[p], slope = {{}};
+            for (int other = 0; other < n_ring; ++other)
+                if (landed.data[other * n_spoke + spoke] > 0.0) {{
+                    const lanes apart = number + 8 * p != other;
+                    const double distance = at - radius.data[other];
+                    slope = apart ? slope * distance + value : slope;
+                    value = apart ? value * distance : value;
+                }}
+            values[p] = value;
+            slopes[p] = slope;
+        }}
+        for (int wave = 0; wave < n_wave; ++wave) {{
+            const float* rays = displacement.data + 2 * (wave * displacement.shape[1] + spoke);
+            double x = 0.0, y = 0.0, slope_x = 0.0, slope_y = 0.0;
+            for (int k = 0; k < n_ring; ++k, rays += 2 * n_spoke)
+                if (landed.data[k * n_spoke + spoke] > 0.0) {{
+                    x += values[k / 8][k % 8] * rays[0];
+                    y += values[k / 8][k % 8] * rays[1];
+                    slope_x += slopes[k / 8][k % 8] * rays[0];
+                    slope_y += slopes[k / 8][k % 8] * rays[1];
+                }}
+            landings.data[ring * n_wave + wave] = wp::vec_t<4, wp::float64>(x, y, slope_x, slope_y);
+        }}
+    }}
+"""
 
 
-@wp.func
-def basis(
+@wp.func_native(_SPOKE_LOOP)
+def interpolate_spoke(
     radius: wp.array(dtype=wp.float64),
-    landed: ring_values,
-    scale: ring_values,
-    at: wp.float64,
+    inverse: wp.array2d(dtype=wp.float64),
+    fraction: wp.array(dtype=wp.float64),
+    start: wp.float64,
+    span: wp.float64,
+    n_spoke: wp.int32,
+    spoke: wp.int32,
+    landed: wp.array(dtype=wp.float64),
+    displacement: wp.array3d(dtype=wp.float32),
+    landings: wp.array2d(dtype=wp.vec4d),
 ):
-    """Values and slopes at a radius of polynomials that are 1 at one ring and 0 at the others whose rays landed.
+    """Interpolate landing points between the rings of one spoke by the polynomial through those that landed.
 
-    ``scale`` is one over the product of a ring's distances from these others, 0 where its own ray was lost.
+    Arguments, beside those of ``place_points`` of one star: squares of the radii at the inner end, start [m^2], and
+    span from there to the outer one; landings [ring, wave]: x, y [m] and their slopes along the spoke at each point.
     """
-    n_ring = radius.shape[0]
-    values = ring_values()
-    slopes = ring_values()
-    # Products over the rings below, times those over the rings above.
-    product = wp.float64(1.0)
-    slope = wp.float64(0.0)
-    for k in range(n_ring):
-        values[k] = product
-        slopes[k] = slope
-        if landed[k] > wp.float64(0.0):
-            slope = slope * (at - radius[k]) + product
-            product = product * (at - radius[k])
-    product = wp.float64(1.0)
-    slope = wp.float64(0.0)
-    for i in range(n_ring):
-        k = n_ring - 1 - i
-        slopes[k] = scale[k] * (slopes[k] * product + values[k] * slope)
-        values[k] = scale[k] * values[k] * product
-        if landed[k] > wp.float64(0.0):
-            slope = slope * (at - radius[k]) + product
-            product = product * (at - radius[k])
-    return values, slopes
+    ...
 
 
 @wp.func
@@ -82,6 +115,7 @@ def place_points(
     mean_shift: wp.array(dtype=wp.float64),
     period: wp.float64,
     area: wp.array(dtype=wp.float64),
+    landings: wp.array4d(dtype=wp.vec4d),
     place: wp.array4d(dtype=wp.float32),
     light: wp.array2d(dtype=wp.float32),
     cut: wp.array3d(dtype=wp.float32),
@@ -94,7 +128,8 @@ def place_points(
     edges [star, spoke, 2] [m]; displacement [star, wave, ring * n_spoke + spoke, 2] of the traced points [m]; landed
     [star, ring * n_spoke + spoke]: 1, or 0 for a ray that was lost; jacobian [star] [m/rad]; cosines [star] of the
     chief ray along the detector; dispersion [wave] [rad]; shift [wave, depth]: path in silicon over its index, and its
-    mean_shift [wave] [m]; period of the images [m]; area [star]: the clear pupil [m^2]. Results, with points in the
+    mean_shift [wave] [m]; period of the images [m]; area [star]: the clear pupil [m^2]; landings [star, spoke, ring,
+    wave]: room for what ``interpolate_spoke`` finds. Results, with points in the
     order of the traced ones and rims as [2, n_spoke]: place [star, wave * n_depth + depth, 2, point] [periods]; light
     [star, point]: part of the pupil; cut [star, rim, 3]: part of the pupil per metre of wavelength and step of
     frequency, along x and y, and that of both strips of the spoke, at most, over its light; lean [star, wave, rim, 2]:
@@ -112,21 +147,25 @@ def place_points(
     start = edges[star, spoke, 0] * edges[star, spoke, 0]
     span = edges[star, spoke, 1] * edges[star, spoke, 1] - start
     landed_rays = zero
-    on_spoke = ring_values()
-    scale = ring_values()
     for ring in range(n_ring):
-        on_spoke[ring] = landed[star, ring * n_spoke + spoke]
-        landed_rays = landed_rays + on_spoke[ring]
-    for k in range(n_ring):
-        scale[k] = on_spoke[k]
-        for ring in range(n_ring):
-            if ring != k and on_spoke[ring] > zero:
-                scale[k] = scale[k] * inverse[k, ring]
+        landed_rays = landed_rays + landed[star, ring * n_spoke + spoke]
     clear = span > zero and landed_rays > zero
     # Direction cosines of the light at the image change along the spoke by this per metre.
     turn = -wp.transpose(wp.inverse(jacobian[star])) * unit[spoke]
     spoke_light = half * span * angle / area[star]
     swept = zero
+    interpolate_spoke(
+        radius,
+        inverse,
+        fraction,
+        start,
+        span,
+        n_spoke,
+        spoke,
+        landed[star],
+        displacement[star],
+        landings[star, spoke],
+    )
     for ring in range(n_ring):
         point = ring * n_spoke + spoke
         light[star, point] = wp.float32(0.0)
@@ -146,24 +185,17 @@ def place_points(
             across = across * (half / (period * area[star]))
             if at > zero:
                 depth = wp.where(end == 0, -half, half) * area[star] / (at * angle)
-        values, slopes = basis(radius, on_spoke, scale, at)
         steepness = cosines[star] + at * turn
         for wave in range(displacement.shape[1]):
-            landing = jacobian[star] * dispersion[wave]
-            slope = wp.vec2d(zero, zero)
-            for k in range(n_ring):
-                if on_spoke[k] > zero:
-                    x = wp.float64(displacement[star, wave, k * n_spoke + spoke, 0])
-                    y = wp.float64(displacement[star, wave, k * n_spoke + spoke, 1])
-                    landing = landing + wp.vec2d(values[k] * x, values[k] * y)
-                    slope = slope + wp.vec2d(slopes[k] * x, slopes[k] * y)
+            ray = landings[star, spoke, ring, wave]
+            landing = jacobian[star] * dispersion[wave] + wp.vec2d(ray[0], ray[1])
             for d in range(shift.shape[1]):
                 deep = landing + shift[wave, d] * steepness
                 light_channel = wave * shift.shape[1] + d
                 place[star, light_channel, 0, point] = wp.float32(deep[0] / period)
                 place[star, light_channel, 1, point] = wp.float32(deep[1] / period)
             if outermost:
-                slope = slope + mean_shift[wave] * turn
+                slope = wp.vec2d(ray[2], ray[3]) + mean_shift[wave] * turn
                 lean[star, wave, rim, 0] = wp.float32(depth * tau / period * slope[0])
                 lean[star, wave, rim, 1] = wp.float32(depth * tau / period * slope[1])
         if outermost:

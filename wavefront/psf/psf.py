@@ -222,8 +222,7 @@ def _render_stars(
     lit_fraction = np.empty((n_star, len(inputs.wavelengths)))
     reference_point, offset, inside = np.empty((n_star, 3)), np.empty((n_star, 2)), np.empty(n_star)
     renderer.prepare(stars.fields)
-    for first in range(0, n_star, renderer.batch):
-        batch = slice(first, min(first + renderer.batch, n_star))
+    for batch in renderer.batches(stars.fields):
         batch_stars = stars[batch]
         rendered = renderer.render(batch_stars.fields, batch_stars.offsets, centroids, batch_stars.photons)
         inside[batch] = rendered.image.sum(axis=(1, 2))
@@ -231,7 +230,7 @@ def _render_stars(
         lit_fraction[batch], reference_point[batch] = rendered.lit_fraction, rendered.reference_point
         offset[batch] = rendered.offset
         if progress is not None:
-            progress(batch.stop - first)
+            progress(len(batch))
     return Psfs(
         image=image,
         pixel_scale=pixel_scale,

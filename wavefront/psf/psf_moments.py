@@ -177,13 +177,12 @@ def psf_moments(
     )
     renderer = _renderer(options, inputs, fwhm / math.sqrt(8.0 * math.log(2.0)))
     stars = replace(stars, offsets=np.zeros_like(stars.offsets))
-    parts, lit = [np.zeros((0, _COLUMNS))], [np.zeros((0, len(inputs.wavelengths)))]
+    values, lit = np.empty((len(stars), _COLUMNS)), np.empty((len(stars), len(inputs.wavelengths)))
     renderer.prepare(stars.fields)
-    for first in range(0, len(stars), renderer.batch):
-        exposed = renderer.expose(stars[first : first + renderer.batch])
-        parts.append(exposed.draw(None))
-        lit.append(exposed.lit_fraction)
-    return _result(stars.fields, np.concatenate(parts), np.concatenate(lit), inputs, renderer.focal_length)
+    for batch in renderer.batches(stars.fields):
+        exposed = renderer.expose(stars[batch])
+        values[batch], lit[batch] = exposed.draw(None), exposed.lit_fraction
+    return _result(stars.fields, values, lit, inputs, renderer.focal_length)
 
 
 #: Numbers of a star: ellipses and flags of both weights.

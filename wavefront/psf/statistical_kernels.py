@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
@@ -10,17 +12,48 @@ from .sample_packets import LANES, samples
 
 wp.set_module_options(FORWARD_OPTIONS)
 
-#: Largest exponent: where a kernel of negative variance would raise what little the long exposure has left.
-LARGEST_EXPONENT = 1.0
+#: Largest factor: where a kernel of negative variance would raise what little the long exposure has left.
+LARGEST_FACTOR = math.e
+
+# In C with vectors of the compiler. Factors of a row follow from those of the row before.
+_ROW_LOOP = f"""
+    typedef float packet __attribute__((vector_size({4 * LANES}), aligned(4)));
+    const packet largest = {LARGEST_FACTOR}f - packet{{}};
+    const packet leaning = *(const packet*)&slant;
+    const int stride = spectrum.shape[2];
+    for (int below = 0; below < 2; ++below) {{
+        packet* re = (packet*)spectrum.data + 2 * below * spectrum.shape[1] * stride + column;
+        packet* im = re + spectrum.shape[1] * stride;
+        const packet tilt = below ? 1.0f / leaning : leaning;
+        packet weight = *(const packet*)&along;
+        float fall = 1.0f, ratio = first_ratio;
+        for (int row = 0; row < n_row; ++row) {{
+            const packet factor = __builtin_elementwise_min(fall * weight, largest);
+            re[row * stride] *= factor;
+            im[row * stride] *= factor;
+            weight *= tilt;
+            fall *= ratio;
+            ratio *= first_ratio * first_ratio;
+        }}
+    }}
+"""
 
 
-@wp.func
-def exponentials(exponent: samples):
-    """Exponentials of lanes, at most of LARGEST_EXPONENT."""
-    out = samples()
-    for i in range(LANES):
-        out[i] = wp.exp(wp.min(exponent[i], wp.float32(LARGEST_EXPONENT)))
-    return out
+@wp.func_native(_ROW_LOOP)
+def blur_rows(
+    spectrum: wp.array3d(dtype=samples),
+    column: wp.int32,
+    n_row: wp.int32,
+    along: samples,
+    slant: samples,
+    first_ratio: wp.float32,
+):
+    """Multiply the rows of a packet of columns of a contiguous spectrum [4, row, packet] by a Gaussian.
+
+    Arguments: along: the Gaussian in row 0, and slant: its factor from one row to the next, but for what depends on the
+    row alone, whose ratio from row 0 to row 1 is first_ratio.
+    """
+    ...
 
 
 @wp.kernel
@@ -39,13 +72,9 @@ def blur_spectra(
     star = first + wp.tid()
     for packet in range(rows.shape[0]):
         number = lane_numbers(packet)
-        along_x = -moments[star, 0] * wp.cw_mul(number, number)
-        for row in range(rows[packet]):
-            ky = wp.float32(row)
-            even = along_x - samples(moments[star, 1] * ky * ky)
-            odd = (wp.float32(-2.0) * moments[star, 2] * ky) * number
-            plus = exponentials(even + odd)
-            minus = exponentials(even - odd)
-            for part in range(2):
-                spectrum[star, part, row, packet] = wp.cw_mul(plus, spectrum[star, part, row, packet])
-                spectrum[star, 2 + part, row, packet] = wp.cw_mul(minus, spectrum[star, 2 + part, row, packet])
+        along = samples()
+        slant = samples()
+        for i in range(LANES):
+            along[i] = wp.exp(-moments[star, 0] * number[i] * number[i])
+            slant[i] = wp.exp(wp.float32(-2.0) * moments[star, 2] * number[i])
+        blur_rows(spectrum[star], packet, rows[packet], along, slant, wp.exp(-moments[star, 1]))
