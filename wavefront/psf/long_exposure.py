@@ -448,7 +448,7 @@ class LongExposureRenderer(PsfRenderer):
         """Return the stamps of transfer functions, shape [n_star, side, side]."""
         n_star, side = len(spectrum), self._plane.size
         n_packet = self._detector.shape[2]
-        lines = np.empty((n_star, n_packet, 2, LANES), dtype=np.float32)
+        lines = np.empty((n_star, 4 * n_packet * LANES), dtype=np.float32)
         image = np.empty((n_star, side, self._pixel_columns.shape[2], LANES), dtype=np.float32)
         launch(
             sample_pixels,
@@ -461,8 +461,7 @@ class LongExposureRenderer(PsfRenderer):
                 warp_array(self._pixel_rows, wp.vec2f),
                 warp_array(self._pixel_columns, samples),
                 warp_array(np.empty_like(spectrum), samples),
-                warp_array(lines, samples),
-                warp_array(lines.reshape(n_star, -1), wp.float32),
+                warp_array(lines, wp.float32),
                 warp_array(image, samples),
             ],
             threads=self._threads,

@@ -338,6 +338,65 @@ def transform_pupils(
                 spectrum[star, 3, row, packet] = spectrum[star, 3, row, packet] + wp.cw_mul(value, sums[star, 3])
 
 
+# In C with vectors of the compiler. Rows of pixels at y and -y have the same cosines along y and opposite sines.
+_PIXEL_LOOP = f"""
+    #pragma clang fp contract(fast)
+    typedef float packet __attribute__((vector_size({4 * LANES}), aligned(4)));
+    const int n_packet = rows.shape[0], n_row = pixel_rows.shape[1], size = pixel_rows.shape[0];
+    const int n_column = pixel_columns.shape[1], across = pixel_columns.shape[2];
+    const packet* wave = (const packet*)waves.data;
+    const packet* turn_x = (const packet*)pixel_columns.data;
+    packet* line = (packet*)lines.data;
+    packet* pixel = (packet*)image.data;
+    // The middle pixel of an even number has one more below than above.
+    const int middle = size / 2;
+    for (int y = 0; y <= middle; ++y) {{
+        const int opposite = 2 * middle - y;
+        const float* turn_y = (const float*)pixel_rows.data + 2 * y * n_row;
+        for (int column = 0; column < n_packet; ++column) {{
+            packet even_re = {{}}, odd_re = {{}}, even_im = {{}}, odd_im = {{}};
+            for (int row = 0; row < rows.data[column]; ++row) {{
+                const packet* at = wave + row * n_packet + column;
+                even_re += turn_y[2 * row] * at[0];
+                even_im += turn_y[2 * row] * at[n_row * n_packet];
+                odd_re += turn_y[2 * row + 1] * at[2 * n_row * n_packet];
+                odd_im += turn_y[2 * row + 1] * at[3 * n_row * n_packet];
+            }}
+            line[4 * column] = even_re + odd_re;
+            line[4 * column + 1] = even_im + odd_im;
+            line[4 * column + 2] = even_re - odd_re;
+            line[4 * column + 3] = even_im - odd_im;
+        }}
+        for (int x = 0; x < across; ++x) {{
+            packet total = {{}}, total_opposite = {{}};
+            for (int column = 0; column < n_column; ++column) {{
+                const float* value = lines.data + 4 * {LANES} * (column / {LANES}) + column % {LANES};
+                const packet cosine = turn_x[column * across + x];
+                const packet sine = turn_x[(n_column + column) * across + x];
+                total += value[0] * cosine - value[{LANES}] * sine;
+                total_opposite += value[{2 * LANES}] * cosine - value[{3 * LANES}] * sine;
+            }}
+            pixel[y * across + x] = total;
+            if (opposite < size)
+                pixel[opposite * across + x] = total_opposite;
+        }}
+    }}
+"""
+
+
+@wp.func_native(_PIXEL_LOOP)
+def add_rows(
+    waves: wp.array3d(dtype=samples),
+    rows: wp.array(dtype=wp.int32),
+    pixel_rows: wp.array2d(dtype=wp.vec2f),
+    pixel_columns: wp.array3d(dtype=samples),
+    lines: wp.array(dtype=wp.float32),
+    image: wp.array2d(dtype=samples),
+):
+    """Add up the waves of one star at all pixels, with the arguments of ``sample_pixels``, contiguous, of that star."""
+    ...
+
+
 @wp.kernel
 def sample_pixels(
     first: wp.int32,
@@ -348,17 +407,16 @@ def sample_pixels(
     pixel_rows: wp.array2d(dtype=wp.vec2f),
     pixel_columns: wp.array3d(dtype=samples),
     waves: wp.array4d(dtype=samples),
-    lines: wp.array3d(dtype=samples),
-    line: wp.array2d(dtype=wp.float32),
+    lines: wp.array2d(dtype=wp.float32),
     image: wp.array3d(dtype=samples),
 ):
     """Sample the image of one star at the centres of its pixels.
 
     Arguments: spectrum as ``transform_pupils`` leaves it; detector [2, row, packet]: its transfer function at +n and
     -n, with the scale of the sum, columns m > 0 twice and row 0 half; offset [star, 2] of the image [periods];
-    pixel_rows [y, row]: cosine and sine; pixel_columns [2, column, packet of x]: cosines and sines; waves [star, 4,
-    row, packet]: room for what goes with the cosine along y, and with the sine; lines [star, packet, 2]: room for a
-    line of pixels, transformed along y; line: the same as plain numbers [star, ...]; image [star, y, packet of x].
+    pixel_rows [y, row]: cosine and sine, evenly about the middle one; pixel_columns [2, column, packet
+    of x]: cosines and sines; waves [star, 4, row, packet]: room for what goes with the cosine along y, and with the
+    sine; lines [star, ...]: room for two lines of pixels, transformed along y; image [star, y, packet of x].
     """
     star = first + wp.tid()
     n_packet = rows.shape[0]
@@ -386,23 +444,4 @@ def sample_pixels(
             waves[star, 1, row, packet] = im_plus + im_minus
             waves[star, 2, row, packet] = im_minus - im_plus
             waves[star, 3, row, packet] = re_plus - re_minus
-    for y in range(pixel_rows.shape[0]):
-        for packet in range(n_packet):
-            re = samples()
-            im = samples()
-            for row in range(rows[packet]):
-                turn_y = pixel_rows[y, row]
-                re = re + turn_y[0] * waves[star, 0, row, packet] + turn_y[1] * waves[star, 2, row, packet]
-                im = im + turn_y[0] * waves[star, 1, row, packet] + turn_y[1] * waves[star, 3, row, packet]
-            lines[star, packet, 0] = re
-            lines[star, packet, 1] = im
-        for packet_x in range(image.shape[2]):
-            total = samples()
-            for column in range(pixel_columns.shape[1]):
-                sample = (column // LANES) * 2 * LANES + column % LANES
-                total = (
-                    total
-                    + line[star, sample] * pixel_columns[0, column, packet_x]
-                    - line[star, sample + LANES] * pixel_columns[1, column, packet_x]
-                )
-            image[star, y, packet_x] = total
+    add_rows(waves[star], rows, pixel_rows, pixel_columns, lines[star], image[star])

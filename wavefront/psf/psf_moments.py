@@ -234,7 +234,7 @@ class _Moments(LongExposureRenderer):
     def __init__(self, inputs: PsfInputs, options: Any, weight_rms: float) -> None:
         self._weight_angle = weight_rms
         super().__init__(inputs, options)
-        self.batch = min(_BATCH, 4 * self.batch)
+        self.batch = min(_BATCH, 2 * self.batch)
         # No light falls beside a stamp.
         self._inputs = replace(self._inputs, plane=replace(self._inputs.plane, size=_WIDE_STAMP))
 

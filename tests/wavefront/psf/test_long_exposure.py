@@ -482,3 +482,20 @@ def test_a_disc_in_the_way_leaves_the_clear_pupil_of_traced_rays(lsst_r):
         # Parabolas place rims to a millimetre, and spokes near a corner of two rims by more.
         assert areas[-1] == pytest.approx(lit.sum() * lattice.spacing**2, rel=3e-3)
     assert areas[1] < 0.98 * areas[0]
+
+
+@pytest.mark.parametrize("size", [24, 25])
+def test_pixels_are_those_of_a_larger_stamp(lsst_r, size):
+    """Rows are sampled in pairs about the middle pixel; the first row of an even number has no opposite one.
+
+    Wings that wrap around change the larger stamp by 1e-4 of the peak at most.
+    """
+
+    def light(size):
+        stamps = Stamps(size, offsets=[[0.3, -1.7]])
+        arguments = {"atmosphere": air(), "stamps": stamps, "engine": "long_exposure", "threads": 1}
+        psf = make_psfs(lsst_r, np.deg2rad([[0.5, -0.3]]), ONE_WAVE, **arguments)
+        return psf.image[0] * psf.inside[0]
+
+    large, middle = light(41), slice(20 - size // 2, 20 - size // 2 + size)
+    assert light(size) == pytest.approx(large[middle, middle], abs=2e-4 * large.max())
