@@ -41,12 +41,12 @@ _MOST = 2
 def fit_steps(star: StarSolution, known: Sequence[AmplifierStep]) -> StepFit | None:
     """Return the steps of a fitted star, None without any; those known were taken off its image."""
     scores = _Scores.of(star)
-    if scores is None or not (known or scores.standing_out()):
+    if scores is None or not (known or scores.steps()):
         return None
     kept = [step.without_chance(_BESIDE) for step in known]
     patterns = [_Pattern(step.axis, step.first, kind) for step in kept for kind in (0, 1) if step.errors[kind]]
     if len(known) < _MOST:
-        patterns += scores.without(patterns).standing_out()
+        patterns += scores.without(patterns).steps()
     if not patterns:
         return None
     amplitudes, variances, moved = scores.amplitudes(patterns)
@@ -128,6 +128,29 @@ class _Scores:
             squares = np.where(known, self.significance(axis), 0.0) ** 2
             mean_squares.append(squares.sum(axis=0) / np.maximum(known.sum(axis=0), 1))
         return np.sqrt(np.maximum(np.max(mean_squares, axis=0), 1.0))
+
+    def steps(self) -> list[_Pattern]:
+        """Return the steps that stand out of all others and of slopes of the response."""
+        return self.beside_slopes().standing_out() if self.standing_out() else []
+
+    def beside_slopes(self) -> _Scores:
+        """Return the same of a model whose unknowns have a slope of the response along each axis, too."""
+        ny, nx = self.pulls.shape
+        places = np.stack(np.broadcast_arrays(np.linspace(-1.0, 1.0, ny)[:, None], np.linspace(-1.0, 1.0, nx)))
+        slopes = np.asarray(self.weights[1] * places, dtype=np.float32)
+        gradients = np.tensordot(self.columns, slopes, ((0, 1), (1, 2)))
+        taken_up = self.scaled @ gradients
+        products = np.tensordot(slopes, slopes, ((1, 2), (1, 2)))
+        variances = np.linalg.pinv(products - gradients.T @ taken_up, hermitian=True)
+        change = np.concatenate([-taken_up, np.eye(len(slopes))])
+        scaled = change @ variances @ change.T
+        scaled[: len(taken_up), : len(taken_up)] += self.scaled
+        moved = np.pad(self.moved, ((0, 0), (0, len(slopes)))) - self.moved @ gradients @ variances @ change.T
+        columns = np.concatenate([self.columns, np.moveaxis(slopes, 0, -1)], axis=2)
+        amplitudes = variances @ np.tensordot(slopes, self.pulls, 2)
+        pulls = self.pulls - columns @ (change @ amplitudes).astype(np.float32)
+        first, second = (_curvatures(self.weights, columns, scaled, axis) for axis in (0, 1))
+        return replace(self, pulls=pulls, columns=columns, scaled=scaled, moved=moved, curvatures=(first, second))
 
     def standing_out(self) -> list[_Pattern]:
         """Return the steps between columns and between rows that stand out of all others."""
