@@ -48,10 +48,8 @@ def test_several_donuts_tell_a_slope_from_coma(behind_focus):
         return pachon.fit_donuts(behind_focus, images, FIELDS, WAVELENGTH, sky_variance=NOISE, model=model, fit=fit)
 
     with_slope, without = fitted(MODEL), fitted(replace(MODEL, detector=replace(DETECTOR, response_slope=0.0)))
-    # Of a flat response, steps between amplifiers explain a part: coma is 5 nm off, and 16 nm without these.
-    steps = pachon.sensing.DonutFlag.AMPLIFIER_STEP
-    assert [[bool(flag & steps) for flag in fit.flags] for fit in (with_slope, without)] == [[False] * 3, [True] * 3]
-    assert np.hypot(*(without.zernikes[0] - wave[3:])[3:5]) > 3e-9
+    # Coma of the flat response is 16 nm off, twice what is claimed.
+    assert np.hypot(*(without.zernikes[0] - wave[3:])[3:5]) > 10e-9
     error = with_slope.zernikes[0] - wave[3:]
     assert np.hypot(*error[3:5]) < 5e-9
     # Of 19 degrees of freedom: 2.6 is five standard deviations.
