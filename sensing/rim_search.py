@@ -113,17 +113,14 @@ def with_another_rim(
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
         if not gains.max(initial=0.0) > least + _PROMISING * misfit:
             break
-        if first is None:
-            likely = gains > _LIKELY * gains.max()
-            tried = list(itertools.compress(bodies, likely))
-            trials = _each_freed(instrument, best, tried, best.solution, solved, threshold)
-        else:
-            trials = _each_freed(instrument, best, bodies, first, solved, threshold)
+        likely = list(itertools.compress(bodies, gains > _LIKELY * gains.max()))
+        tried, start = (likely, best.solution) if first is None else (bodies, first)
+        trials = _each_freed(instrument, best, tried, start, solved, threshold)
         gain = best.solution.loss - trials[0].solution.loss
         if gain >= threshold:
             return _best_of(trials)
         if first is None:
-            failed += itertools.compress(bodies, likely)
+            failed += likely
         elif gain < _SHORT * threshold:
             break
         first = None

@@ -41,7 +41,7 @@ _MOST = 2
 def fit_steps(star: StarSolution, known: Sequence[AmplifierStep]) -> StepFit | None:
     """Return the steps of a fitted star, None without any; those known were taken off its image."""
     scores = _Scores.of(star)
-    if scores is None or not (known or scores.steps()):
+    if scores is None:
         return None
     kept = [step.without_chance(_BESIDE) for step in known]
     patterns = [_Pattern(step.axis, step.first, kind) for step in kept for kind in (0, 1) if step.errors[kind]]
@@ -138,10 +138,8 @@ class _Scores:
         ny, nx = self.pulls.shape
         places = np.stack(np.broadcast_arrays(np.linspace(-1.0, 1.0, ny)[:, None], np.linspace(-1.0, 1.0, nx)))
         slopes = np.asarray(self.weights[1] * places, dtype=np.float32)
-        gradients = np.tensordot(self.columns, slopes, ((0, 1), (1, 2)))
+        gradients, variances = self._least_squares(slopes)
         taken_up = self.scaled @ gradients
-        products = np.tensordot(slopes, slopes, ((1, 2), (1, 2)))
-        variances = np.linalg.pinv(products - gradients.T @ taken_up, hermitian=True)
         change = np.concatenate([-taken_up, np.eye(len(slopes))])
         scaled = change @ variances @ change.T
         scaled[: len(taken_up), : len(taken_up)] += self.scaled
@@ -183,7 +181,8 @@ class _Scores:
         """Return a pattern at the pixel of the detector where it explains most beside others."""
 
         def explained(candidate: _Pattern) -> float:
-            images, _, variances = self._least_squares([*beside, candidate])
+            images = self._images([*beside, candidate])
+            _, variances = self._least_squares(images)
             products = np.tensordot(images, self.pulls, 2)
             return float(products @ variances @ products)
 
@@ -195,24 +194,29 @@ class _Scores:
 
         What the model lacks makes the covariance larger by the scatter of all steps without these.
         """
-        images, gradients, variances = self._least_squares(patterns)
+        images = self._images(patterns)
+        gradients, variances = self._least_squares(images)
         scatter = self.without(patterns).scatter[[pattern.kind for pattern in patterns]]
         amplitudes = variances @ np.tensordot(images, self.pulls, 2)
         return amplitudes, variances * np.outer(scatter, scatter), -self.moved @ gradients
 
-    def _least_squares(self, patterns: Sequence[_Pattern]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return unit steps over the noise [p, ny, nx], their products with columns [n, p], and variances [p, p]."""
-        images = np.stack([self._image(pattern) for pattern in patterns])
+    def _images(self, patterns: Sequence[_Pattern]) -> np.ndarray:
+        """Return the changes of the image by unit steps over the noise, shape [p, ny, nx]."""
+        return np.stack([self._image(pattern) for pattern in patterns])
+
+    def _least_squares(self, images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return products of changes of the image [p, ny, nx] with columns [n, p], and variances of these [p, p]."""
         gradients = np.tensordot(self.columns, images, ((0, 1), (1, 2)))
         squares = np.tensordot(images, images, ((1, 2), (1, 2)))
         variances = np.linalg.pinv(squares - gradients.T @ self.scaled @ gradients, hermitian=True)
-        return images, gradients, variances
+        return gradients, variances
 
     def without(self, patterns: Sequence[_Pattern]) -> _Scores:
         """Return the same for the residuals that a fit with these steps leaves."""
         if not patterns:
             return self
-        images, gradients, variances = self._least_squares(patterns)
+        images = self._images(patterns)
+        gradients, variances = self._least_squares(images)
         amplitudes = variances @ np.tensordot(images, self.pulls, 2)
         taken_up = self.columns @ (self.scaled @ (gradients @ amplitudes)).astype(np.float32)
         return replace(self, pulls=self.pulls + taken_up - np.tensordot(amplitudes, images, 1))

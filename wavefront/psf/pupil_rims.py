@@ -83,11 +83,7 @@ class PupilRims:
         ``landing`` holds landing points of the points of the polynomials [m].
         """
         places, slopes = smooth.at(self.points, landing)
-        return places, self.along_normals(slopes)
-
-    def along_normals(self, slopes: np.ndarray) -> np.ndarray:
-        """Return derivatives along the normals [n, k] from those along both axes of the pupil [n, k, 2]."""
-        return np.einsum("nij,nj->ni", slopes, self.normals)
+        return places, np.einsum("nij,nj->ni", slopes, self.normals)
 
     def transfer(self, baseline: np.ndarray, wave: np.ndarray, landing: np.ndarray, inward: np.ndarray) -> np.ndarray:
         """Return the transfer function of diffraction at the rims, shape [n_frequency], complex64.
