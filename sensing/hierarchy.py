@@ -38,6 +38,8 @@ _LINEAR_RMS = 150e-9
 _FALL = 4.0
 #: Standard deviation of the logarithm of the logarithm of that fall.
 _FALL_SPREAD = 0.5
+#: The same of pupil terms of any degree, beside these, of mirrors that are bent: LSST's with 10 nm of each mode.
+_BENT_RMS = 5e-9
 #: Rms of what stars have of their own in the telescope's wavefront, about which its prior lies [m].
 _LOCAL_RMS = 10e-9
 #: Rms of terms that are uniform over the field: nearly no prior [m].
@@ -92,14 +94,16 @@ class Basis:
     pupil_degree: np.ndarray | None = None
     variance: np.ndarray | None = None
 
-    def variances(self, linear: float, fall: float) -> np.ndarray:
-        """Return variances of the terms by the rms of linear ones [m] and the fall with each degree, shape [n_term]."""
+    def variances(self, sizes: Sizes) -> np.ndarray:
+        """Return variances of the terms by the sizes of the parts [m^2], shape [n_term]."""
         if self.variance is not None:
             return self.variance
         assert self.field_degree is not None
         assert self.pupil_degree is not None
-        steps = (self.field_degree - 1) + (self.pupil_degree - self.pupil_degree.min())
-        return np.where(self.field_degree == 0, _UNIFORM_RMS**2, linear**2 * fall ** -steps.astype(float))
+        beyond = self.field_degree - 1.0
+        steps = beyond + (self.pupil_degree - self.pupil_degree.min())
+        varying = sizes.linear**2 * sizes.fall**-steps + sizes.bent**2 * _FALL**-beyond
+        return np.where(self.field_degree == 0, _UNIFORM_RMS**2, varying)
 
 
 @dataclass(frozen=True)
@@ -115,7 +119,9 @@ class Sizes:
     linear : float
         Rms of a linear field term of the lowest pupil terms [m].
     fall : float
-        Fall of the variances of field terms with each degree.
+        Fall of the variances of these with each degree over field or pupil.
+    bent : float
+        Rms of linear field terms of all pupil terms alike, beside these [m].
     local : float
         Rms of what each star has of its own in the telescope's wavefront [m].
     """
@@ -124,6 +130,7 @@ class Sizes:
     air: float
     linear: float
     fall: float
+    bent: float
     local: float
 
 
@@ -174,20 +181,21 @@ def fit_hierarchy(observations: Observations, basis: Basis, shape: np.ndarray, a
         Rms of the air's wavefront, Z4 to Z22 [m]; fitted by default.
     """
     model = _Model(observations, basis, shape)
-    free = [True, air is None, basis.variance is None, basis.variance is None, observations.repeated]
-    middle = np.array([0.0, math.log(air or AIR_RMS), math.log(_LINEAR_RMS), math.log(math.log(_FALL)), 0.0])
-    middle[4] = math.log(_LOCAL_RMS if observations.repeated else 1e-3 * _UNIT)
+    of_field = basis.variance is None
+    free = [True, air is None, of_field, of_field, of_field, observations.repeated]
+    local = _LOCAL_RMS if observations.repeated else 1e-3 * _UNIT
+    middle = np.log([1.0, air or AIR_RMS, _LINEAR_RMS, math.log(_FALL), _BENT_RMS, local])
     # Standard deviations of the logarithms of rms are half of those of variances.
-    spread = np.array([_SCALE_SPREAD, 0.5 * _WIDE, 0.5 * _WIDE, _FALL_SPREAD, 0.5 * _WIDE])
-    least = middle - 4.0 * spread
-    most = np.where(np.arange(5) == 1, math.log(MOST_AIR), middle + 4.0 * spread)
+    spread = np.array([_SCALE_SPREAD, 0.5 * _WIDE, 0.5 * _WIDE, _FALL_SPREAD, 0.5 * _WIDE, 0.5 * _WIDE])
+    least, most = middle - 4.0 * spread, middle + 4.0 * spread
+    most[1] = math.log(MOST_AIR)
     index = np.flatnonzero(free)
 
     def sizes(values: np.ndarray) -> Sizes:
         logarithms = middle.copy()
         logarithms[index] = values
-        noise, rms, linear, fall, local = np.exp(logarithms)
-        return Sizes(noise, rms, linear, math.exp(fall), local)
+        noise, rms, linear, fall, bent, local = np.exp(logarithms)
+        return Sizes(noise, rms, linear, math.exp(fall), bent, local)
 
     def loss(values: np.ndarray) -> float:
         prior = float((((values - middle[index]) / spread[index]) ** 2).sum())
@@ -235,7 +243,7 @@ class _Model:
 
         Degrees of freedom have units of their own; terms over the field are in metres.
         """
-        variance = self._basis.variances(sizes.linear, sizes.fall)
+        variance = self._basis.variances(sizes)
         ground = GROUND * (sizes.air / _UNIT) ** 2 * self._shape
         ground = ground + 1e-12 * np.trace(ground) * np.eye(self._n)
         precision = np.diag(np.concatenate([1.0 / variance, np.zeros(self._n_shared)]))

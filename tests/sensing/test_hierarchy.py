@@ -54,7 +54,7 @@ def test_posterior_is_that_of_dense_algebra():
     basis = field_basis(places)
     fit = fit_hierarchy(observations, basis, shape())
     sizes, n, count = fit.sizes, len(NOLL), len(places)
-    prior = np.diag(basis.variances(sizes.linear, sizes.fall))
+    prior = np.diag(basis.variances(sizes))
     columns = basis.columns.reshape(count * n, -1)
     telescope = columns @ prior @ columns.T + np.kron(star[:, None] == star, sizes.local**2 * shape())
     shared = GROUND * (exposure[:, None] == exposure) + (1.0 - GROUND) * np.eye(count)
