@@ -73,20 +73,24 @@ def cross_checked(
     freedom = count - terms
     both_sides = terms == 1 and len(set(behind[group])) == 2
     most = math.inf if both_sides else _MOST_SCATTER**2 * freedom
-    noise, lacking, in_air = (
-        float(sum(w * np.trace(of(parts[i])) for w, i in zip(free, group, strict=True)))
-        for of in (_noise, _lacking, lambda errors: errors.air)
+    noise, residuals = (
+        float(sum(w * np.trace(of(parts[i])) for w, i in zip(free, group, strict=True))) for of in (_noise, _residuals)
     )
+    # All of them have looked through one air, of which the residuals of one donut say little.
+    common = np.mean([parts[i].air for i in group], axis=0)
+    in_air = freedom * float(np.trace(common))
+    lacking = residuals + in_air
     if measured_air and in_air > 0.0 and scatter < most + noise + lacking:
-        others = noise + lacking - in_air
+        others = noise + residuals
         # What donuts share of the air is no part of the scatter.
         scale = _scale_of_air(scatter, others, _AIR_OF_ITS_OWN * in_air, _INDEPENDENT * freedom)
-        air_of_each = [scale * errors.air for errors in parts]
+        of_group = set(group.tolist())
+        air_of_each = [scale * (common if i in of_group else errors.air) for i, errors in enumerate(parts)]
         checked = [
             ErrorParts.of(errors.photons, errors.residuals, scaled, errors.floor)
             for errors, scaled in zip(parts, air_of_each, strict=True)
         ]
-        lacking = others - noise + scale * _AIR_OF_ITS_OWN * in_air
+        lacking = residuals + scale * _AIR_OF_ITS_OWN * in_air
     excess = scatter - noise - lacking
     if excess > most:
         return list(parts)
@@ -117,6 +121,10 @@ def _scale_of_air(scatter: float, others: float, air: float, freedom: float) -> 
 
 def _noise(errors: ErrorParts) -> np.ndarray:
     return errors.photons
+
+
+def _residuals(errors: ErrorParts) -> np.ndarray:
+    return errors.residuals
 
 
 def _lacking(errors: ErrorParts) -> np.ndarray:
