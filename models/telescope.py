@@ -354,6 +354,20 @@ class Telescope(Pictured):
         """
         return replace(self, obstructions=(*self.obstructions, *obstructions))
 
+    def in_medium(self, medium: Medium) -> Telescope:
+        """Return the telescope in another medium: in air, where its prescription has vacuum before and behind lenses.
+
+        Parameters
+        ----------
+        medium : Medium
+            What takes the place of `medium_before`, there and behind surfaces that have the same, such as
+            ``pachon.models.Air(69328.0, 293.15)``.
+        """
+        surfaces = (
+            replace(s, medium_after=medium) if s.medium_after == self.medium_before else s for s in self.surfaces
+        )
+        return replace(self, medium_before=medium, surfaces=tuple(surfaces))
+
     @property
     def sphere_radius(self) -> float:
         """Radius of reference spheres [m]: `reference_sphere_radius`, infinite where the image is."""

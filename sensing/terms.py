@@ -15,8 +15,10 @@ from ..wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
 _LOW_TERMS = 22
 # Terms up to the sixth radial degree, of which misaligned optics have a little.
 _LAST_TERM = 28
-# Rms of terms that are not fitted over those two degrees lower: of LSST's mirrors, out of figure.
-_FALL = 0.07
+# Rms of terms that are not fitted over that of terms whose radial degree and number of rings add up to one less, from a
+# least sum on: of LSST's mirrors, bent by 10 nm of each of their first twenty modes (donuts of danish 1.3.0's tests).
+_FALL = 0.65
+_LEAST = 6
 # Terms up to the eleventh radial degree: what the mean wavefront of the air has beyond is lost in the seeing.
 _AIR_TERMS = 78
 
@@ -82,15 +84,12 @@ class WavefrontTerms:
     def spreads_beyond(self, noll: np.ndarray) -> np.ndarray:
         """Return the rms of terms that are not fitted [m].
 
-        Beyond Z22, of which telescopes have as much as of any before, it falls with each degree beyond those fitted.
+        Beyond Z22, of which telescopes have as much as of any before, it falls with the sum of the radial degree and
+        the number of rings of a term.
         """
-        highest = _highest_degrees(self.every)
-        # Azimuthal orders beyond those asked for have the degrees of the largest of these.
-        largest = {m % 2: highest[m] for m in sorted(highest, key=abs)}
-        degrees = [noll_to_nm(int(j)) for j in noll]
-        steps = np.array([(n - highest.get(m, largest.get(m % 2, abs(m)))) / 2 for n, m in degrees])
-        steps = np.where(np.asarray(noll) <= _LOW_TERMS, 0.0, np.maximum(steps, 0.0))
-        return self.higher_order * _FALL**steps
+        degree, order = np.array([noll_to_nm(int(j)) for j in noll]).reshape(-1, 2).T
+        sums = degree + (degree - np.abs(order)) // 2
+        return self.higher_order * _FALL ** np.where(np.asarray(noll) <= _LOW_TERMS, 0, np.maximum(sums - _LEAST, 0))
 
 
 def _highest_degrees(noll: np.ndarray) -> dict[int, int]:

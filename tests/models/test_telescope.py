@@ -7,6 +7,7 @@ from astropy import units as u
 
 import pachon
 from pachon.core.errors import DomainError, PrescriptionError, UnknownNameError
+from pachon.design.metrics.field_zernikes import wavefront_zernikes
 from pachon.models.io.prescription import load_telescope
 from pachon.models.rotation import rotation_matrix
 from pachon.models.surface import Interaction
@@ -222,3 +223,16 @@ def test_whole_turns_of_the_rotator_change_no_bit(turns):
 def test_an_angle_of_the_rotator_that_is_no_number_is_refused(angle):
     with pytest.raises(DomainError, match=r"angle = .*: expected one finite number"):
         LSST.with_rotator(angle)
+
+
+def test_a_telescope_in_air_is_the_one_described_in_air():
+    """LSST's lens table in the air of the one with baffles, which states it: spherical aberration changes by 4 nm."""
+    stated = load_telescope("lsst_v3.3_r_obstructed")
+    assert stated.medium_before == pachon.models.Air(69328.0, 293.15, 1067.0, formula="filippenko")
+    field = np.deg2rad([[1.2, 0.5]])
+    vacuum, in_air, expected = (
+        wavefront_zernikes(telescope, field, 620e-9, jmax=22).coefficients[0]
+        for telescope in (LSST, LSST.in_medium(stated.medium_before), stated)
+    )
+    np.testing.assert_allclose(in_air, expected, rtol=0, atol=0.02e-9)
+    assert vacuum[10] - expected[10] == pytest.approx(4.3e-9, abs=0.1e-9)

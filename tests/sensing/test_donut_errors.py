@@ -14,6 +14,7 @@ from pachon.models.aperture import Circle
 from pachon.models.zernike_polynomials import noll_to_nm
 from pachon.sensing.air_shape import air_shape
 from pachon.sensing.cross_check import cross_checked
+from pachon.sensing.hierarchy import GROUND
 from pachon.sensing.likelihood import Linearized
 from pachon.sensing.noise import measured_noise
 from pachon.sensing.residual_power import residual_power
@@ -198,6 +199,18 @@ def test_scatter_of_donuts_beyond_their_errors_is_claimed():
     assert np.sqrt(np.trace(apart[0].total)) == pytest.approx(20e-9)
 
 
+def test_donuts_of_one_exposure_claim_one_air():
+    rng = np.random.default_rng(8)
+    fields, air_rms = rng.uniform(-0.7, 0.7, (10, 2)), np.array([1e-9, 30e-9, 100e-9, 170e-9, 200e-9] * 2)
+    # The rest of the variance, near the ground, all have in common.
+    values = rng.normal(0.0, np.sqrt((1.0 - GROUND) / 19) * 128e-9, (10, 19))
+    parts = [replace(parts_of(20e-9), air=np.eye(19) * rms**2 / 19) for rms in air_rms]
+    checked = cross_checked(fields, values, parts, np.ones(10, dtype=bool), lambda: np.eye(19) / 19, measured_air=True)
+    claimed = np.array([np.sqrt(np.trace(errors.air)) for errors in checked])
+    np.testing.assert_allclose(claimed, claimed[0], rtol=1e-12)
+    assert claimed[0] == pytest.approx(np.sqrt(np.mean(air_rms**2)), rel=0.15)
+
+
 def test_a_star_on_both_sides_of_focus_claims_what_its_sides_differ_by():
     fields, sides = np.zeros((2, 2)), np.array([True, False])
     values = np.outer([0.5, -0.5], np.where(np.arange(19) == 7, 300e-9, 0.0))
@@ -252,13 +265,10 @@ N_DONUTS, N_NOISE = 10, 2
 
 
 def further_spreads():
-    """Rms [m] of Z23 to Z78: 10 nm of the degree after Z4 to Z22 at each azimuthal order, 7 % of it two degrees on."""
-    highest = {}
-    for n, m in map(noll_to_nm, range(4, 23)):
-        highest[m] = max(highest.get(m, 0), n)
-    degrees = [noll_to_nm(j) for j in range(23, 79)]
-    # Z27, Z28, Z35 and Z36, of orders 6 and 7, are of the next degrees, too.
-    return np.array([10e-9 * 0.07 ** ((n - highest.get(m, 4 + n % 2)) / 2 - 1) for n, m in degrees])
+    """Rms [m] of Z23 to Z78: 10 nm of the lowest, less with the degree and rings, as LSST's bent mirrors have it."""
+    degrees = np.array([noll_to_nm(j) for j in range(23, 79)])
+    rings = (degrees[:, 0] - abs(degrees[:, 1])) // 2
+    return 10e-9 * 0.65 ** (degrees[:, 0] + rings - 6.0)
 
 
 def drawn(rng, count):
