@@ -57,4 +57,6 @@ class PupilLattice:
         means = np.array([angle[a, b] * radius[a + b] if (a, b) in angle else 0.0 for a, b in powers])
         monomials = np.array([x**a * y**b for a, b in powers])
         deficit = means * len(x) - monomials.sum(axis=1)
-        return 1.0 + np.linalg.lstsq(monomials, deficit, rcond=None)[0]
+        # Least squares of so wide a matrix crash in LAPACK from some 1e5 points on; those of its triangle are the same.
+        basis, triangle = np.linalg.qr(monomials.T)
+        return np.asarray(1.0 + basis @ np.linalg.lstsq(triangle.T, deficit, rcond=None)[0])

@@ -69,6 +69,17 @@ def test_lattice_fills_the_annulus_evenly():
     assert np.mean(points[:, 0] * points[:, 1]) == pytest.approx(0.0, abs=1e-12)
 
 
+def test_lattice_of_a_star_far_from_focus_has_weights():
+    """Least squares of LAPACK end the program at so many points, of which a donut of 5 mm asks."""
+    lattice = PupilLattice.fill(8.36, 0.612, 0.0102)
+    weights = lattice.weights(8.36, 0.612)
+    x, y = lattice.points.T / 4.18
+    assert len(weights) > 300_000
+    # Closed forms of the annulus: means of r^2 and r^4.
+    assert weights @ (x**2 + y**2) / len(x) == pytest.approx((1.0 + 0.612**2) / 2.0, rel=1e-12)
+    assert weights @ (x**2 + y**2) ** 2 / len(x) == pytest.approx((1.0 + 0.612**2 + 0.612**4) / 3.0, rel=1e-12)
+
+
 def test_weights_make_sums_integrals_up_to_fourth_order():
     lattice = PupilLattice.fill(8.36, 0.612, 0.476)
     weights = lattice.weights(8.36, 0.612)
