@@ -26,7 +26,7 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ..aberration import ResidualWavefront
 from ..atmosphere.atmosphere import Atmosphere
-from ..atmosphere.turbulence import fried_parameter
+from ..atmosphere.turbulence import diffraction_otf, fried_parameter
 from ..pupil_optics import PupilOptics
 from ..request import Request
 from .engine import ExposedStars, PsfEngine, PsfInputs, Stars
@@ -35,7 +35,6 @@ from .light import Light
 from .long_exposure import LongExposureEngine, LongExposureRenderer
 from .moment_kernels import ELLIPSE, measure_spectra
 from .psf import psf_inputs
-from .pupil_rims import strip_overlap
 from .sample_packets import samples
 from .stamps import Stamps
 from .statistical import StatisticalEngine, StatisticalRenderer, far_from_focus
@@ -52,7 +51,7 @@ WEIGHT_FWHM_ALONE = 0.3 * ARCSEC
 _WEIGHTS = 12.0
 _WEIGHTS_ALONE = 16.0
 _SEEINGS = 6.0
-#: Longest baseline of the integral over the image of the air, in Fried parameters, and its nodes.
+#: Longest baseline of the integral over the mean image, in Fried parameters, and its nodes.
 _FRIEDS = 5.0
 _NODES = 100
 #: Narrowest and widest FWHM of the weight [rad].
@@ -268,7 +267,7 @@ class _Moments(LongExposureRenderer):
     def _background(self) -> float:
         """Light a pixel of the wings of all periodic images but one, in its middle.
 
-        It is what the sum over frequencies has beyond the integral, of the mean image of the air alone.
+        It is what the sum over frequencies has beyond the integral, of the mean image of ideal optics.
         """
         air = self._inputs.atmosphere
         if air is None:
@@ -280,7 +279,7 @@ class _Moments(LongExposureRenderer):
             count = np.arange(-math.ceil(longest / step), math.ceil(longest / step) + 1)
             squares, places = np.unique(np.add.outer(count**2, count**2), return_counts=True)
             baseline = np.concatenate([step * np.sqrt(squares), longest * root**2])
-            transfer = self._turbulence(baseline)[wave] * strip_overlap(baseline, self._diameter, self._obscuration)
+            transfer = self._turbulence(baseline)[wave] * diffraction_otf(baseline, self._diameter, self._obscuration)
             integral = 4.0 * math.pi * (longest / step) ** 2 / _NODES * root**3 @ transfer[len(squares) :]
             beyond.append(places @ np.where(baseline <= longest, transfer, 0.0)[: len(squares)] - integral)
         return float(np.mean(beyond)) * (self._plane.pixel_size / self.period) ** 2
