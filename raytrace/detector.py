@@ -43,7 +43,8 @@ def land_on_ccds(
     ccd = focal_plane.ccd_at(x, y)
     t = _distance_to_ccd(focal_plane, ccd, (x, y, z), (u, v, w), STEPS)
     # A ray that crosses the edge on its last micrometres has left the CCD. (In a gap, index -1, t has no meaning.)
-    ccd = np.where(focal_plane.ccd_at(x + t * u, y + t * v) == ccd, ccd, -1).astype(np.int32)
+    on_ccd = (ccd >= 0) & (focal_plane.camera.depth(ccd, x + t * u, y + t * v) >= 0.0)
+    ccd = np.where(on_ccd, ccd, -1).astype(np.int32)
     t = np.where(ccd >= 0, t, 0.0)
     return Landing(position + t[:, None] * direction, index * t, ccd)
 

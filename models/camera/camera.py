@@ -334,10 +334,10 @@ class Camera(Pictured):
             inside = (np.abs(u - at[:, 0]) <= a) & (np.abs(v - at[:, 1]) <= b)
         return np.where(inside, kind.index[nearest], -1)
 
-    def depth(self, ccd: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return how far inside the nearest rim of a CCD points lie [m]; negative beyond."""
+    def depth(self, ccd: Any, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return how far inside the nearest rim of a CCD, one or that of each, points lie [m]; negative beyond."""
         u, v = self.to_local(ccd, x, y)
-        a, b = self.half_sizes[ccd]
+        a, b = self.half_sizes[ccd].T
         return np.minimum(a - np.abs(u), b - np.abs(v))
 
     # ---- kept

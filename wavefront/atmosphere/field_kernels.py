@@ -235,6 +235,36 @@ def spline_weight(number: wp.int32, part: wp.float64):
     return weight / six
 
 
+# In C: each value is a sum over 16 coefficients, and stays in a register. Each operation is a statement, so that none
+# is contracted.
+@wp.func_native("""
+    const int n_field = coefficients.shape[0], size = coefficients.shape[1];
+    const float* field = coefficients.data;
+    for (int f = 0; f < n_field; ++f, field += (long long)size * size) {
+        double total = 0.0;
+        for (int j = 0; j < 4; ++j) {
+            const float* row = field + (long long)((((knot_y + j - 1) % size) + size) % size) * size;
+            for (int i = 0; i < 4; ++i) {
+                const double weight = along_y.c[j] * along_x.c[i];
+                const double part = weight * (double)row[columns.c[i]];
+                total = total + part;
+            }
+        }
+        values.data[f] = total;
+    }
+""")
+def add_coefficients(
+    coefficients: wp.array3d(dtype=wp.float32),
+    knot_y: wp.int32,
+    columns: wp.vec4i,
+    along_x: wp.vec4d,
+    along_y: wp.vec4d,
+    values: wp.array(dtype=wp.float64),
+):
+    """Add up the 16 coefficients [field, row, column] around a place, with their weights, for all fields."""
+    ...
+
+
 @wp.kernel
 def read_splines(
     first: wp.int32,
@@ -252,10 +282,11 @@ def read_splines(
     knot_y = wp.int32(wp.floor(place[item, 1]))
     part_x = place[item, 0] - wp.float64(knot_x)
     part_y = place[item, 1] - wp.float64(knot_y)
-    for j in range(4):
-        row = (((knot_y + j - 1) % size) + size) % size
-        for i in range(4):
-            column = (((knot_x + i - 1) % size) + size) % size
-            weight = spline_weight(j, part_y) * spline_weight(i, part_x)
-            for field in range(coefficients.shape[0]):
-                values[item, field] = values[item, field] + weight * wp.float64(coefficients[field, row, column])
+    columns = wp.vec4i()
+    along_x = wp.vec4d()
+    along_y = wp.vec4d()
+    for i in range(4):
+        columns[i] = (((knot_x + i - 1) % size) + size) % size
+        along_x[i] = spline_weight(i, part_x)
+        along_y[i] = spline_weight(i, part_y)
+    add_coefficients(coefficients, knot_y, columns, along_x, along_y, values[item])

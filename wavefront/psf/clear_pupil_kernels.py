@@ -37,8 +37,11 @@ def within(a: wp.float64, b: wp.float64, c: wp.float64, square: wp.float64):
     curvature = half * (a - two * b + c)
     slope = b - a - curvature
     start = a - square
-    # A NaN fails both comparisons; a linear squared distance may have any small curvature.
-    if curvature > zero:
+    # A NaN fails all comparisons; a linear squared distance may have any small curvature.
+    if curvature > zero and start < zero and c < square:
+        # All of it, without roots: most rims of most spokes.
+        high = two
+    elif curvature > zero:
         inner = slope * slope - wp.float64(4.0) * curvature * start
         if inner > zero:
             # The two roots without the difference of near-equal numbers.
@@ -123,13 +126,13 @@ def find_edges(
         inside = wp.max(inside, radius[0] + step * low)
         outside = wp.min(outside, radius[0] + step * high)
         hole = surfaces.numbers[s, APERTURE + 2] * surfaces.numbers[s, APERTURE + 2]
-        low, high = within(a, b, c, hole)
         # A parabola may dip a little below zero where rays meet.
-        if hole > wp.float64(0.0) and high > low:
+        if hole > wp.float64(0.0):
+            low, high = within(a, b, c, hole)
             # The larger of the two pieces that the hole leaves.
-            if low > wp.float64(2.0) - high:
+            if high > low and low > wp.float64(2.0) - high:
                 outside = wp.min(outside, radius[0] + step * low)
-            else:
+            elif high > low:
                 inside = wp.max(inside, radius[0] + step * high)
     if inside >= outside:
         inside = half * (inside + outside)

@@ -219,8 +219,8 @@ def _without_rotator(telescope: Telescope) -> tuple[Telescope, float]:
     return replace(telescope, surfaces=(*telescope.surfaces[:-1], unturned)), angle
 
 
-# Of a night: six bands, through three pupils.
-@lru_cache(maxsize=18)
+# Of a night: six bands, through four pupils.
+@lru_cache(maxsize=24)
 def _field_optics(
     telescope: Telescope, wavelengths: tuple[float, ...], n_ring: int, n_spoke: int
 ) -> FieldOptics | None:

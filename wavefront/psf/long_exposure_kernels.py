@@ -283,6 +283,9 @@ def transform_pupils(
             for component in range(4):
                 spectrum[star, component, row, packet] = samples()
     for wave in range(n_wave):
+        # Dark is the middle one of spectral rules.
+        if photons[star, wave] == wp.float32(0.0):
+            continue
         for depth in range(n_depth):
             light_channel = wave * n_depth + depth
             for point in range(n_point):

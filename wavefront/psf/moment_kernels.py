@@ -152,6 +152,7 @@ def measure_spectra(
     detector: wp.array3d(dtype=samples),
     rows: wp.array(dtype=wp.int32),
     start: wp.array2d(dtype=wp.float64),
+    background: wp.float64,
     adaptive: bool,
     most_steps: wp.int32,
     tolerance: wp.float64,
@@ -161,7 +162,8 @@ def measure_spectra(
     """Measure moments of one star under a Gaussian weight about its centroid, round or as elliptical as the image.
 
     Lengths are in units of the period over 2 pi. Arguments: spectrum and detector as those of ``sample_pixels``; start
-    [star, 5]: centroid of the first weight, and its moments xx, yy, xy; most_steps, tolerance of the centroid and of
+    [star, 5]: centroid of the first weight, and its moments xx, yy, xy; background, even light under the image [light a
+    pixel], to be subtracted; most_steps, tolerance of the centroid and of
     the moments' square root, as a part of the weight's width; ellipse [star, ELLIPSE]: centroid, central moments xx,
     yy, xy under the weight or, where it is adaptive, of the weight itself, and the weighted total; flags [star]: 1
     where the iteration has not converged, 2 where moments are not positive, 8 where there is no light.
@@ -187,14 +189,16 @@ def measure_spectra(
                 wp.float32(yy),
                 wp.float32(xy),
             )
-            if not (sums[0] > zero):
+            # A weight of volume one has these sums on even light.
+            total = sums[0] - background
+            if not (total > zero):
                 flag = wp.int32(8)
             else:
-                mean_x = sums[1] / sums[0]
-                mean_y = sums[2] / sums[0]
-                image_xx = sums[3] / sums[0] - mean_x * mean_x
-                image_yy = sums[4] / sums[0] - mean_y * mean_y
-                image_xy = sums[5] / sums[0] - mean_x * mean_y
+                mean_x = sums[1] / total
+                mean_y = sums[2] / total
+                image_xx = (sums[3] - background * xx) / total - mean_x * mean_x
+                image_yy = (sums[4] - background * yy) / total - mean_y * mean_y
+                image_xy = (sums[5] - background * xy) / total - mean_x * mean_y
                 image_det = image_xx * image_yy - image_xy * image_xy
                 weight_det = xx * yy - xy * xy
                 # Q^-1 - W^-1, of the image that the weight has narrowed.
@@ -228,7 +232,7 @@ def measure_spectra(
                     ellipse[star, 4] = wp.where(adaptive, wide_xy, image_xy)
                     if change < tolerance * tolerance:
                         flag = wp.int32(0)
-                    ellipse[star, 5] = sums[0]
+                    ellipse[star, 5] = total
     ellipse[star, 0] = x
     ellipse[star, 1] = y
     flags[star] = flag

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -25,7 +26,7 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ..aberration import ResidualWavefront
 from ..atmosphere.atmosphere import Atmosphere
-from ..atmosphere.turbulence import fried_parameter
+from ..atmosphere.turbulence import diffraction_otf, fried_parameter
 from ..pupil_optics import PupilOptics
 from ..request import Request
 from .engine import ExposedStars, PsfEngine, PsfInputs, Stars
@@ -45,9 +46,14 @@ if TYPE_CHECKING:
 #: FWHM of the weight with an atmosphere, and without one [rad] (Jee & Tyson 2011, sec. 3).
 WEIGHT_FWHM = 0.7 * ARCSEC
 WEIGHT_FWHM_ALONE = 0.3 * ARCSEC
-#: Side of the periodic image over the rms width of the weight, and over the FWHM of the seeing, at least.
-_WEIGHTS = 16.0
-_SEEINGS = 8.0
+#: Side of the periodic image over the rms width of the weight, with and without an atmosphere, and over the FWHM of the
+#: seeing, at least.
+_WEIGHTS = 12.0
+_WEIGHTS_ALONE = 16.0
+_SEEINGS = 6.0
+#: Longest baseline of the integral over the mean image, in Fried parameters, and its nodes.
+_FRIEDS = 5.0
+_NODES = 100
 #: Narrowest and widest FWHM of the weight [rad].
 _WEIGHT_FWHMS = (0.02 * ARCSEC, 20.0 * ARCSEC)
 #: Width of the narrowest weight over that of the first: it decides which frequencies count.
@@ -248,11 +254,35 @@ class _Moments(LongExposureRenderer):
         return self._weight_angle * self.focal_length
 
     def _period(self) -> float:
-        air, width = self._inputs.atmosphere, _WEIGHTS * self._weight_angle
-        if air is not None:
+        air = self._inputs.atmosphere
+        if air is None:
+            width = _WEIGHTS_ALONE * self._weight_angle
+        else:
             longest = float(self._wavelengths.max())
-            width = max(width, _SEEINGS * longest / float(fried_parameter(air.r0, longest)))
+            seeing = longest / float(fried_parameter(air.r0, longest))
+            width = max(_WEIGHTS * self._weight_angle, _SEEINGS * seeing)
         return max(width * self.focal_length, 8.0 * self._plane.pixel_size)
+
+    @cached_property
+    def _background(self) -> float:
+        """Light a pixel of the wings of all periodic images but one, in its middle.
+
+        It is what the sum over frequencies has beyond the integral, of the mean image of ideal optics.
+        """
+        air = self._inputs.atmosphere
+        if air is None:
+            return 0.0
+        # Evenly in the root of the baseline: structure functions go as its power of 5/3.
+        root, beyond = np.linspace(0.0, 1.0, _NODES + 1), []
+        for wave, step in enumerate(self._step):
+            longest = min(self._diameter, _FRIEDS * float(fried_parameter(air.r0, self._wavelengths[wave])))
+            count = np.arange(-math.ceil(longest / step), math.ceil(longest / step) + 1)
+            squares, places = np.unique(np.add.outer(count**2, count**2), return_counts=True)
+            baseline = np.concatenate([step * np.sqrt(squares), longest * root**2])
+            transfer = self._turbulence(baseline)[wave] * diffraction_otf(baseline, self._diameter, self._obscuration)
+            integral = 4.0 * math.pi * (longest / step) ** 2 / _NODES * root**3 @ transfer[len(squares) :]
+            beyond.append(places @ np.where(baseline <= longest, transfer, 0.0)[: len(squares)] - integral)
+        return float(np.mean(beyond)) * (self._plane.pixel_size / self.period) ** 2
 
     def _transfer_bounds(self, longest: float) -> np.ndarray:
         bounds = super()._transfer_bounds(longest)
@@ -293,6 +323,7 @@ class _Moments(LongExposureRenderer):
                 warp_array(self._detector, samples),
                 warp_array(self._rows, wp.int32),
                 warp_array(start / scale[:5]),
+                self._background,
                 adaptive,
                 _MOST_STEPS,
                 _TOLERANCE,

@@ -109,10 +109,12 @@ class StatisticalRenderer(LongExposureRenderer):
 
     # What is left out moves e by 1e-6 and pixels by 3e-5 of the peak, a hundredth of what third moments would.
     negligible = 1e-4
-    # With M2 10 um out of focus e of the LSST is wrong by 3e-4 along 64 spokes at 0.55, its size by 1e-4; by 4e-4 and
-    # 3e-4 along 128 at 0.38, by 6e-4 and 3e-4 at 0.2 to 0.3, where the lattice, which takes four times as long, has
-    # 5e-4 and 2e-4.
-    dense = ((0.5, 64, 5), (0.2, 128, 6))
+    # With 0.1 um of aberration e of the LSST is wrong by 5e-4 (rms of both components) along 12 spokes at 0.75 to 0.85.
+    least_lit = 0.85
+    # By 2.6e-4 along 24 at 0.7 to 0.85. With M2 10 um out of focus by 3e-4 along 64 spokes at 0.55, its size by 1e-4;
+    # by 4e-4 and 3e-4 along 128 at 0.38, by 6e-4 and 3e-4 at 0.2 to 0.3, where the lattice, which takes four times as
+    # long, has 5e-4 and 2e-4.
+    dense = ((0.7, 24, 5), (0.5, 64, 5), (0.2, 128, 6))
 
     def __init__(self, inputs: PsfInputs, options: StatisticalEngine) -> None:
         air = inputs.atmosphere
