@@ -70,6 +70,8 @@ class StarFit:
         Whether its search holds for a fit that begins from it, which has further Zernikes, or the rims of all stars.
     preliminary : bool
         Whether a fit that begins from it has to look for rims elsewhere in fine pixels.
+    light : StarLight, optional
+        Light of the star for a fit that begins from it, which is traced by default.
     """
 
     flags: DonutFlag
@@ -79,11 +81,19 @@ class StarFit:
     sides: BothSides | None = None
     searched: bool = False
     preliminary: bool = False
+    light: StarLight | None = None
 
     @property
     def usable(self) -> StarSolution | None:
         """The best model where no flag says that there is no result."""
         return self.best if self.flags.usable else None
+
+    def with_light(self, instrument: Instrument) -> StarFit:
+        """Return the same with the star's light for a fit with diffraction or without, if its rims are as believed."""
+        if self.best is None or self.best.light.free_rims.bodies:
+            return self
+        light = self.best.light
+        return replace(self, light=instrument.diffracted(light) if instrument.model.diffraction else light)
 
 
 def fit_star(
@@ -179,7 +189,7 @@ def _continued(
     rivals = tuple(
         RimFit(fitter.with_free_rims(rival.rims).light, best.stamp, begin(rival.wave)) for rival in own_rivals
     )
-    best_begun = begin(solution.shared[:known])
+    best_begun, fitter = begin(solution.shared[:known]), fitter.beginning_from(best)
     return _finished(fitter, pixels.central(shape), best_begun, begun.sides, sky_level, rivals)
 
 
