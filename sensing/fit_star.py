@@ -295,7 +295,7 @@ def _search_of_rims(begun: StarFitter, search: _Search) -> _Search:
     like a cosmic ray, so that rims are searched for without those. Pixels of the fitter that has begun are used again
     where the model with these rims explains them.
     """
-    if search.misfit <= _MISFIT:
+    if search.misfit <= _MISFIT or _diffraction_explains(begun, search):
         return search
     found, first = replace(search, best=search.single), search.start.unknowns
     begin: Solution | None = replace(search.single, stars=(first,), shared=np.zeros_like(search.single.shared))
@@ -309,6 +309,15 @@ def _search_of_rims(begun: StarFitter, search: _Search) -> _Search:
     if found.misfit > _MISFIT and begun.instrument.model.neighbours:
         return replace(found, best=_with_neighbours(found.fitter, found.start, found.best))
     return found
+
+
+def _diffraction_explains(fitter: StarFitter, search: _Search) -> bool:
+    """Return whether diffraction, where it is not yet known to matter, leaves no more misfit than noise does."""
+    if fitter.instrument.model.diffraction is not None:
+        return False
+    light, pixels, best = fitter.instrument.diffracted(fitter.light), search.start.pixels, search.best
+    stamp = search.fitter.with_light(light).stamp(light, pixels, blended=len(best.stars[0]) > RATIO)
+    return _misfit(stamp, search.fitter.solve(stamp, best.stars[0], best.shared, COARSE)) <= _MISFIT
 
 
 def _with_another_rim(search: _Search, first: Solution | None) -> _Search:
