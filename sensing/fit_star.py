@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from ..models.zernike_polynomials import noll_to_nm
 from .bad_pixels import without_bad_pixels
+from .donut_rays import ZernikeRays
 from .flags import DonutFlag
 from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y
 from .light import Instrument, StarLight
@@ -295,7 +297,7 @@ def _search_of_rims(begun: StarFitter, search: _Search) -> _Search:
     like a cosmic ray, so that rims are searched for without those. Pixels of the fitter that has begun are used again
     where the model with these rims explains them.
     """
-    if search.misfit <= _MISFIT or _diffraction_explains(begun, search):
+    if search.misfit <= _MISFIT:
         return search
     found, first = replace(search, best=search.single), search.start.unknowns
     begin: Solution | None = replace(search.single, stars=(first,), shared=np.zeros_like(search.single.shared))
@@ -311,20 +313,23 @@ def _search_of_rims(begun: StarFitter, search: _Search) -> _Search:
     return found
 
 
-def _diffraction_explains(fitter: StarFitter, search: _Search) -> bool:
+def _diffraction_explains(search: _Search) -> bool:
     """Return whether diffraction, where it is not yet known to matter, leaves no more misfit than noise does."""
+    fitter, start, best = search.fitter, search.start.stamp, search.best
     if fitter.instrument.model.diffraction is not None:
         return False
-    light, pixels, best = fitter.instrument.diffracted(fitter.light), search.start.pixels, search.best
-    stamp = search.fitter.with_light(light).stamp(light, pixels, blended=len(best.stars[0]) > RATIO)
-    return _misfit(stamp, search.fitter.solve(stamp, best.stars[0], best.shared, COARSE)) <= _MISFIT
+    light, rays = fitter.instrument.diffracted(fitter.light), start.rays
+    assert isinstance(rays, ZernikeRays)
+    stamp = fitter.instrument.stamp(light, search.start.pixels, rays, start.grid.sharp, start.grid.reach)
+    return _misfit(stamp, fitter.solve(stamp, best.stars[0], best.shared, COARSE)) <= _MISFIT
 
 
 def _with_another_rim(search: _Search, first: Solution | None) -> _Search:
     """Return a search with one more rim free, from the unknowns where the search began; the same without one."""
     fitter, start = search.fitter, search.start
     fit = RimFit(fitter.light, start.stamp, search.best, search.rivals)
-    found = with_another_rim(fitter.instrument, fit, _MISFIT, _coarse_solver(fitter, start), first)
+    explained = partial(_diffraction_explains, search)
+    found = with_another_rim(fitter.instrument, fit, _MISFIT, _coarse_solver(fitter, start), first, explained)
     return search if found is fit else _of_rims(fitter, start, found)
 
 

@@ -155,7 +155,7 @@ def test_diffraction_of_bright_donuts_is_not_taken_for_rims_elsewhere(monkeypatc
         raise AssertionError("a search for rims, which takes seconds")
 
     # By rays alone coarse pixels leave twice the misfit from which on rims are searched for.
-    monkeypatch.setattr("pachon.sensing.fit_star.with_another_rim", searched)
+    monkeypatch.setattr("pachon.sensing.rim_search._each_freed", searched)
     fit = pachon.fit_donuts(telescope, donuts.images, donuts.fields, donuts.wavelength, sky_variance=381.0, model=model)
     assert fit.diffraction
     assert np.linalg.norm(fit.zernikes[0]) < 3.0 * np.sqrt(np.trace(fit.covariance[0]))
