@@ -115,11 +115,11 @@ class PupilRims:
         # Those of the places, then of their changes: [2 * piece, axis, unknown].
         moved = np.zeros((2, pieces.shape[1], 2, count), dtype=np.float32)
         moved[:, self._place] = np.stack([response, inward_response]).swapaxes(1, 2)
-        moved = moved.reshape(-1, 2 * count)
+        by_unknowns = moved.reshape(-1, 2 * count)
         for first in range(0, len(wave), _CHUNK):
             piece = slice(first, first + _CHUNK)
             values[piece], parts = self._sums(baseline[piece], wave[piece], pieces, slopes=True)
-            along = (parts.reshape(2 * len(parts), -1) @ moved).reshape(-1, 2, 2, count)
+            along = (parts.reshape(2 * len(parts), -1) @ by_unknowns).reshape(-1, 2, 2, count)
             along *= wave[piece, None, :, None].astype(np.float32)
             out[piece].real, out[piece].imag = (along[:, part, 0] + along[:, part, 1] for part in (0, 1))
         return values, out
