@@ -109,7 +109,7 @@ class ZernikeRays:
         noll: np.ndarray,
     ) -> None:
         self._direction, self._wavelengths, self._fractions = direction, wavelengths, wavelength_weights
-        self.cells, self._points = cells, cells.points
+        self.cells, self._points, self.noll = cells, cells.points, noll
         self._weights, self.rates = cells.at_wavelengths(wavelength_weights)
         self._middle = float(wavelengths[len(wavelengths) // 2])
         #: Derivatives of the terms along x and y of the plane of the entrance pupil [1/m], [n_term, 2, n_point].

@@ -206,9 +206,11 @@ def fit_donuts(
 
         def first(i: int) -> StarFit:
             ready = by_rays.get(i)
-            if ready is None or instrument.model.diffraction:
-                return alone(instrument, i, ready)
-            return alone(instrument, i, replace(ready, searched=True)) if ready.preliminary else ready
+            if ready is None:
+                return alone(instrument, i)
+            waves = bool(instrument.model.diffraction)
+            ends = not (waves or ready.preliminary)
+            return ready if ends else alone(instrument, i, replace(ready.with_light(instrument), searched=not waves))
 
         def once_more(refined: Instrument) -> _Fitted:
             return fitted_stars(refined, lambda i: alone(refined, i, replace(fitted.stars[i], searched=True)))
@@ -285,7 +287,7 @@ def _fit_alone(
     if np.hypot(*star.field) > instrument.telescope.field_limit * (1.0 + 1e-12):
         return StarFit(DonutFlag.OUTSIDE_FIELD)
     try:
-        light = instrument.light(star.direction, defocus)
+        light = (begun and begun.light) or instrument.light(star.direction, defocus)
     except DomainError:
         return StarFit(DonutFlag.NO_LIGHT)
     not_finite = ~np.isfinite(star.image) & ~star.masked

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from ..models.zernike_polynomials import noll_to_nm
 from .bad_pixels import without_bad_pixels
+from .donut_rays import ZernikeRays
 from .flags import DonutFlag
 from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y
 from .light import Instrument, StarLight
@@ -70,6 +72,8 @@ class StarFit:
         Whether its search holds for a fit that begins from it, which has further Zernikes, or the rims of all stars.
     preliminary : bool
         Whether a fit that begins from it has to look for rims elsewhere in fine pixels.
+    light : StarLight, optional
+        Light of the star for a fit that begins from it, which is traced by default.
     """
 
     flags: DonutFlag
@@ -79,11 +83,19 @@ class StarFit:
     sides: BothSides | None = None
     searched: bool = False
     preliminary: bool = False
+    light: StarLight | None = None
 
     @property
     def usable(self) -> StarSolution | None:
         """The best model where no flag says that there is no result."""
         return self.best if self.flags.usable else None
+
+    def with_light(self, instrument: Instrument) -> StarFit:
+        """Return the same with the star's light for a fit with diffraction or without, if its rims are as believed."""
+        if self.best is None or self.best.light.free_rims.bodies:
+            return self
+        light = self.best.light
+        return replace(self, light=instrument.diffracted(light) if instrument.model.diffraction else light)
 
 
 def fit_star(
@@ -179,7 +191,7 @@ def _continued(
     rivals = tuple(
         RimFit(fitter.with_free_rims(rival.rims).light, best.stamp, begin(rival.wave)) for rival in own_rivals
     )
-    best_begun = begin(solution.shared[:known])
+    best_begun, fitter = begin(solution.shared[:known]), fitter.beginning_from(best)
     return _finished(fitter, pixels.central(shape), best_begun, begun.sides, sky_level, rivals)
 
 
@@ -301,11 +313,23 @@ def _search_of_rims(begun: StarFitter, search: _Search) -> _Search:
     return found
 
 
+def _diffraction_explains(search: _Search) -> bool:
+    """Return whether diffraction, where it is not yet known to matter, leaves no more misfit than noise does."""
+    fitter, start, best = search.fitter, search.start.stamp, search.best
+    if fitter.instrument.model.diffraction is not None:
+        return False
+    light, rays = fitter.instrument.diffracted(fitter.light), start.rays
+    assert isinstance(rays, ZernikeRays)
+    stamp = fitter.instrument.stamp(light, search.start.pixels, rays, start.grid.sharp, start.grid.reach)
+    return _misfit(stamp, fitter.solve(stamp, best.stars[0], best.shared, COARSE)) <= _MISFIT
+
+
 def _with_another_rim(search: _Search, first: Solution | None) -> _Search:
     """Return a search with one more rim free, from the unknowns where the search began; the same without one."""
     fitter, start = search.fitter, search.start
     fit = RimFit(fitter.light, start.stamp, search.best, search.rivals)
-    found = with_another_rim(fitter.instrument, fit, _MISFIT, _coarse_solver(fitter, start), first)
+    explained = partial(_diffraction_explains, search)
+    found = with_another_rim(fitter.instrument, fit, _MISFIT, _coarse_solver(fitter, start), first, explained)
     return search if found is fit else _of_rims(fitter, start, found)
 
 

@@ -184,20 +184,20 @@ class Instrument:
         jacobian = image_jacobians(telescope, direction[None], self.middle, 1)[0]
         # Light passes up to half a cell beyond the outermost points.
         diameter = 2.0 * float(np.hypot(*place.T).max()) * (1.0 + 1.0 / _SURVEY)
-        diffracting = None
-        if self.model.diffraction:
-            pieces = diffracting_pieces(diameter / self.pixel)
-            diffracting = pupil_rims(telescope, direction, self.middle, pieces)
         rims = movable_rims(telescope, points, ends)
-        light = StarLight(
-            telescope, direction, diameter, depth, jacobian, rims, diffracting, slope_spreads=self.slope_spreads
-        )
+        light = StarLight(telescope, direction, diameter, depth, jacobian, rims, slope_spreads=self.slope_spreads)
+        light = self.diffracted(light) if self.model.diffraction else light
         if self.free_rims.bodies:
             return light.with_free_rims(self.free_rims, self.middle)
         if not self.model.rims.size:
             return light
         free = rims_of_other_size(telescope, direction, self.middle, _FEWEST, self.model.rims.size)
         return light.with_free_rims(free, self.middle)
+
+    def diffracted(self, light: StarLight) -> StarLight:
+        """Return the light with the rims of the pupil at which it is diffracted."""
+        pieces = diffracting_pieces(light.diameter / self.pixel)
+        return replace(light, pupil_rims=pupil_rims(light.telescope, light.direction, self.middle, pieces))
 
     def _depth(self, telescope: Telescope, direction: np.ndarray) -> float:
         """Return the distance from the detector to the best focus [m], from few rays."""

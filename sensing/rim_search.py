@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -84,6 +84,7 @@ def with_another_rim(
     noise: float,
     solved: RimSolver,
     first: Solution | None = None,
+    explained: Callable[[], bool] = lambda: False,
 ) -> RimFit:
     """Return the fit with one more rim free if the residuals say that it stands elsewhere, or the same fit.
 
@@ -100,6 +101,8 @@ def with_another_rim(
     first : Solution, optional
         Unknowns from which the best fit began: all rims are then tried from these, since the wavefront of a fit whose
         rims are held has taken up where they stand.
+    explained : callable, optional
+        Whether something else explains the residuals, which is computed before rims are tried.
     """
     failed: list[RimBody] = []
     free = [body for body in best.light.free_rims.bodies if body.moved]
@@ -111,7 +114,7 @@ def with_another_rim(
         bodies, gains = rim_gains(instrument, best)
         moved = {body.members for body in (*free, *failed)}
         gains = np.where([body.members in moved for body in bodies], 0.0, gains)
-        if not gains.max(initial=0.0) > least + _PROMISING * misfit:
+        if not gains.max(initial=0.0) > least + _PROMISING * misfit or explained():
             break
         likely = list(itertools.compress(bodies, gains > _LIKELY * gains.max()))
         tried, start = (likely, best.solution) if first is None else (bodies, first)

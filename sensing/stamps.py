@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import fft
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import fftconvolve
 from scipy.special import ndtri
 
 #: Rms of the Gaussian before sampling, in new pixels.
@@ -177,12 +178,12 @@ def match_template(
     pixels = np.where(used, image, 0.0)
     residual = pixels - np.tensordot(np.tensordot(basis, pixels, 2), basis, 1)
     # What of the template is no plane tells it from the background.
-    contrast = fftconvolve(used.astype(np.float64), mirrored**2)
-    contrast -= sum(fftconvolve(plane, mirrored) ** 2 for plane in basis)
+    (on_used,) = _convolved([used], mirrored**2)
+    *on_planes, product = _convolved([*basis, residual], mirrored)
+    contrast = on_used - sum(on_plane**2 for on_plane in on_planes)
     enough = contrast > least_on_stamp * whole
     if not enough.any():
         return nothing
-    product = fftconvolve(residual, mirrored)
     contrast = np.where(enough, contrast, 1.0)
     score = np.where(enough, product / np.sqrt(contrast), -np.inf)
     ny, nx = image.shape
@@ -194,6 +195,14 @@ def match_template(
     noise = np.sqrt(max(float(np.mean(variance)) + photons, measured, _LEAST_VARIANCE))
     background = _plane_of(np.tensordot(basis, pixels - flux * moved(template, *place) * used, 2), basis, used)
     return Match(float(place[1]), float(place[0]), flux, float(score[row, column] / noise), background)
+
+
+def _convolved(images: Sequence[np.ndarray], kernel: np.ndarray) -> np.ndarray:
+    """Return the full convolutions of images by a kernel of their shape [n, ny, nx], in single precision."""
+    ny, nx = (2 * n - 1 for n in kernel.shape)
+    size = [fft.next_fast_len(n, real=True) for n in (ny, nx)]
+    *spectra, by = fft.rfft2(np.array([*images, kernel], dtype=np.float32), s=size)
+    return np.asarray(fft.irfft2(np.array(spectra) * by, s=size)[:, :ny, :nx])
 
 
 def moved(image: np.ndarray, down: int, right: int) -> np.ndarray:

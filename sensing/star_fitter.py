@@ -79,6 +79,8 @@ class StarSolution:
         Its unknowns.
     model : ndarray
         Best image of all pixels [electrons].
+    sampling : Sampling, optional
+        How finely that of the last fit is sampled.
     errors : StarErrors, optional
         Errors of the fit by itself, of :mod:`.star_errors`, where they are at hand.
     rivals : tuple of Rival
@@ -92,6 +94,7 @@ class StarSolution:
     full: Stamp
     solution: Solution
     model: np.ndarray
+    sampling: Sampling | None = None
     errors: object = None
     rivals: tuple[Rival, ...] = ()
     steps: StepFit | None = None
@@ -168,6 +171,18 @@ class StarFitter:
         n = len(self.precision)
         self._map = np.eye(n)[None] if self._wavefront else np.zeros((1, n, 0))
         self._rays: dict[int, ZernikeRays] = {}
+        self._begun: StarSolution | None = None
+
+    def beginning_from(self, star: StarSolution) -> StarFitter:
+        """Return the same with the sampling of a fit of the star, if light of the same terms was traced for that."""
+        rays = star.stamp.rays
+        assert isinstance(rays, ZernikeRays)
+        same_light = star.light.telescope is self._light.telescope
+        if star.sampling is None or not (same_light and np.array_equal(rays.noll, self.instrument.noll)):
+            return self
+        fitter = copy(self)
+        fitter._rays, fitter._begun = {star.sampling.across: rays}, star
+        return fitter
 
     @property
     def searches_rims(self) -> bool:
@@ -252,7 +267,9 @@ class StarFitter:
 
         Rivals are coarse fits of other rims that are as good. A preliminary model has no rims elsewhere.
         """
-        best, blended, fine = coarse, len(coarse.stars[0]) > RATIO, None
+        best, blended, fine = coarse, len(coarse.stars[0]) > RATIO, self._fine_begun()
+        if fine is not None:
+            best = self.solve(fine.stamp, best.stars[0], best.shared)
         # The seeing of a solution decides how finely the next one is sampled.
         for _ in range(_SCALES):
             finer = self.sampled(best, blended, fine)
@@ -293,7 +310,7 @@ class StarFitter:
             stamp = replace(stamp, used=replace(self.clean, used=used).binned(fine.pixels.side).used)
             best = self.solve(stamp, best.stars[0], best.shared)
             model = model_image(full, best.stars[0], best.waves[0])
-        return StarSolution(self._light, stamp, full, best, model)
+        return StarSolution(self._light, stamp, full, best, model, fine.sampling)
 
     def with_measured_noise(self, star: StarSolution, sky_level: float) -> tuple[StarSolution, float]:
         """Return a solution in the unit in which what it leaves has the noise of electrons, and that unit."""
@@ -344,6 +361,14 @@ class StarFitter:
         stamp = self.sampled_stamp(pixels, sampling, light.diameter if blended else self._overhang(solution))
         return _Fine(stamp, pixels, sampling, few_cells)
 
+    def _fine_begun(self) -> _Fine | None:
+        """Return the stamp sampled as that of the fit that this one begins from, if it has its light."""
+        if self._begun is None or self._begun.sampling is None:
+            return None
+        grid, sampling = self._begun.stamp.grid, self._begun.sampling
+        pixels = self._binned_pixels(round(grid.scale))
+        return _Fine(self.sampled_stamp(pixels, sampling, grid.reach), pixels, sampling)
+
     def _error(self, solution: Solution) -> float:
         """Return the error of the wavefront by photons [m], infinite without one."""
         wave = slice(len(self.instrument.noll)) if len(solution.shared) else slice(0)
@@ -358,8 +383,11 @@ class StarFitter:
         return float(np.clip(place + 0.5 * self._light.diameter - middle, 0.0, self._light.diameter).max())
 
     def _sampling(self, fwhm: float, side: int, error: float = math.inf) -> tuple[Pixels, Sampling]:
-        pixels = self._binned.get(side) or self._binned.setdefault(side, self.clean.binned(side))
+        pixels = self._binned_pixels(side)
         return pixels, self.instrument.sampling(self._light, pixels, fwhm, error)
+
+    def _binned_pixels(self, side: int) -> Pixels:
+        return self._binned.get(side) or self._binned.setdefault(side, self.clean.binned(side))
 
     def every_pixel(self, fine: _Fine) -> Stamp:
         """Return the stamp with all pixels of the detector."""

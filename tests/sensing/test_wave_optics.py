@@ -8,6 +8,7 @@ from scipy import fft
 from scipy.ndimage import map_coordinates
 
 import pachon
+from pachon.pipeline.simulate.donut_file import DonutScene, simulate_donuts
 from pachon.raytrace.rays import RayStatus
 from pachon.wavefront.atmosphere.turbulence import coherence, long_exposure_fwhm, structure_function
 from pachon.wavefront.chief_rays import image_jacobians
@@ -140,3 +141,21 @@ def test_donuts_of_waves_are_told_from_those_of_rays(behind_focus):
     # By rays alone 50 nm, and a chi-square of 1.13.
     assert (fit.chi2 / fit.n_pixels).max() < 1.03
     assert np.linalg.norm(fit.zernikes, axis=1).max() < 50e-9
+
+
+@pytest.mark.long
+def test_diffraction_of_bright_donuts_is_not_taken_for_rims_elsewhere(monkeypatch):
+    telescope = pachon.load_telescope("decam")
+    detector = pachon.DonutDetector(15e-6, defocus=1.5e-3, moved="DECam")
+    model = pachon.DonutModel(detector=detector).with_light(None)
+    scene = DonutScene(stars=1, stamp=64, electrons=4e6)
+    donuts = simulate_donuts(telescope, telescope, scene, model, np.deg2rad([-0.03, -0.17]))
+
+    def searched(*_):
+        raise AssertionError("a search for rims, which takes seconds")
+
+    # By rays alone coarse pixels leave twice the misfit from which on rims are searched for.
+    monkeypatch.setattr("pachon.sensing.rim_search._each_freed", searched)
+    fit = pachon.fit_donuts(telescope, donuts.images, donuts.fields, donuts.wavelength, sky_variance=381.0, model=model)
+    assert fit.diffraction
+    assert np.linalg.norm(fit.zernikes[0]) < 3.0 * np.sqrt(np.trace(fit.covariance[0]))

@@ -23,31 +23,28 @@ lost: :math:`w` and the sinc give way to :math:`(2 \cos 2h' - 1)\, t - \max(t - 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
+import warp as wp
 
+from ...core.launch import launch
+from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
 from ..atmosphere.turbulence import diffraction_otf
 from ..pupil_polynomials import PupilPolynomials
 from .clear_pupil import clear_edges, has_only_annuli
+from .pupil_rim_kernels import PIECE_NUMBERS, sum_strips
 from .pupil_scan import no_vanes, points_of_plane, scanned_edges, scanned_vanes
+from .sample_packets import LANES
 
 #: Pieces of each rim: two pixels of a donut of 120.
 PIECES = 192
 # Curvature of a rim, over that of the pupil's own, up to which it is no corner.
 _MOST_CURVED = 5.0
-# Coefficients of the series of the sinc by the square of the lean of strips, and leans [rad] up to which so many of
-# them are the sinc to 1e-4.
-_SINC = tuple(np.float32(1.0 / v) for v in (-6.0, 120.0, -5040.0, 362880.0))
-_SERIES = (0.3, 0.85, 1.6, 2.4)
-# Lean of a strip [rad] below which the sinc is a parabola.
-_SMALL_LEAN = 0.05
-# Width of strips over the radius of the pupil up to which the rim is straight along them and all wavefronts lean alike.
-_NARROW = 0.05
-# Frequencies at a time: their strips stay in the processor's cache.
-_CHUNK = 128
+# Frequencies at a time: their strips take some 30 MB.
+_CHUNK = 4096
 
 
 @dataclass(frozen=True)
@@ -97,12 +94,7 @@ class PupilRims:
         inward : ndarray, shape [n, 2]
             Change of these places per metre of the pupil along the normals.
         """
-        out = np.empty(len(wave), dtype=np.complex64)
-        for strips in self._strips(baseline, wave, landing, inward):
-            light = strips.amplitude()
-            out[strips.piece].real = np.einsum("fn,fn->f", light, np.cos(strips.phase))
-            out[strips.piece].imag = -np.einsum("fn,fn->f", light, np.sin(strips.phase))
-        return out
+        return self._sums(baseline, wave, self._packets(landing, inward), slopes=False)[0]
 
     def transfer_slopes(
         self,
@@ -118,130 +110,52 @@ class PupilRims:
         ``response`` has those of the landing points [m], and ``inward_response`` those of ``inward``, both of shape
         [2, n, n_unknown].
         """
-        values, out = (np.empty((len(wave), *shape), dtype=np.complex64) for shape in ((), response.shape[2:]))
-        moved, leant = response.astype(np.float32), inward_response.astype(np.float32)
-        for strips in self._strips(baseline, wave, landing, inward):
-            light, cosine, sine = strips.amplitude(), np.cos(strips.phase), np.sin(strips.phase)
-            real, imaginary = light * cosine, -light * sine
-            values[strips.piece].real, values[strips.piece].imag = real.sum(axis=1), imaginary.sum(axis=1)
-            slopes = [(imaginary @ v, -(real @ v)) for v in moved]
-            if strips.wide:
-                # What the phase changes across a strip goes with that of its middle, and changes the mean.
-                half, change = 0.5 * strips.width, 0.5 * strips.width * strips.amplitude_slope()
-                by_lean = change * cosine, -change * sine
-                rims = np.s_[:, : strips.rims]
-                by_lean[0][rims] += half[rims] * imaginary[rims]
-                by_lean[1][rims] -= half[rims] * real[rims]
-                for along, v in zip(slopes, leant, strict=True):
-                    for slope, lean in zip(along, by_lean, strict=True):
-                        slope += lean @ v
-            out[strips.piece].real, out[strips.piece].imag = (
-                sum(strips.wave[:, i, None] * slopes[i][part] for i in (0, 1)) for part in (0, 1)
-            )
-        return values, out
-
-    def _strips(
-        self, baseline: np.ndarray, wave: np.ndarray, landing: np.ndarray, inward: np.ndarray
-    ) -> Iterator[_Strips]:
-        """Yield the strips at some frequencies after the other."""
-        across, places, steps = (v.T.astype(np.float32) for v in (0.5 * self.normals, landing, 0.5 * inward))
-        straight, bent = (v.astype(np.float32) for v in (-self.parts, self.parts * self.curvatures))
-        narrow = _NARROW * float(np.abs(self.points).max(initial=0.0))
-        rims, thick = len(self.points) - len(self.vane_widths), self.vane_widths.astype(np.float32)
-        steepest = math.sqrt(float((steps**2).sum(axis=0).max(initial=0.0)))
+        count, pieces = response.shape[2], self._packets(landing, inward)
+        values, out = (np.empty((len(wave), *shape), dtype=np.complex64) for shape in ((), (count,)))
+        # Those of the places, then of their changes: [2 * piece, axis, unknown].
+        moved = np.zeros((2, pieces.shape[1], 2, count), dtype=np.float32)
+        moved[:, self._place] = np.stack([response, inward_response]).swapaxes(1, 2)
+        by_unknowns = moved.reshape(-1, 2 * count)
         for first in range(0, len(wave), _CHUNK):
             piece = slice(first, first + _CHUNK)
-            b, k = (v[piece].astype(np.float32) for v in (baseline, wave))
-            width = b @ across
-            np.abs(width, out=width)
-            lean = k @ steps
-            lean *= width
-            square = (b * b).sum(axis=1)
-            widest = 0.5 * math.sqrt(float(square.max()))
-            most = widest * math.sqrt(float((k * k).sum(axis=1).max())) * steepest
-            wide, light = widest > narrow, straight * width
-            if wide:
-                light += bent * width * width - np.outer(np.float32(0.125) * square, bent)
-            phase = k @ places
-            phase[:, :rims] += lean[:, :rims]
-            light[:, rims:] = straight[rims:]
-            yield _Strips(piece, k, light, width, lean, phase, most, wide, rims, thick)
+            values[piece], parts = self._sums(baseline[piece], wave[piece], pieces, slopes=True)
+            along = (parts.reshape(2 * len(parts), -1) @ by_unknowns).reshape(-1, 2, 2, count)
+            along *= wave[piece, None, :, None].astype(np.float32)
+            out[piece].real, out[piece].imag = (along[:, part, 0] + along[:, part, 1] for part in (0, 1))
+        return values, out
+
+    @cached_property
+    def _place(self) -> np.ndarray:
+        """Places of the pieces in whole packets of rims, then of vanes, shape [n]."""
+        rims, vanes = len(self.points) - len(self.vane_widths), len(self.vane_widths)
+        return np.concatenate([np.arange(rims), _whole_packets(rims) + np.arange(vanes)])
+
+    def _packets(self, landing: np.ndarray, inward: np.ndarray) -> np.ndarray:
+        """Return the numbers of the pieces for :func:`.pupil_rim_kernels.sum_strips`, [PIECE_NUMBERS, n_packet]."""
+        vanes = len(self.vane_widths)
+        count = _whole_packets(len(self.points) - vanes) + _whole_packets(vanes)
+        pieces = np.zeros((PIECE_NUMBERS, count), dtype=np.float32)
+        widths = np.concatenate([np.zeros(len(self.points) - vanes), self.vane_widths])
+        own = (*(0.5 * self.normals.T), *landing.T, *(0.5 * inward.T), self.parts, self.curvatures, widths)
+        pieces[:, self._place] = np.stack(own)
+        return pieces
+
+    def _sums(
+        self, baseline: np.ndarray, wave: np.ndarray, pieces: np.ndarray, *, slopes: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return :meth:`transfer` from packets of pieces, and with slopes the parts of its derivatives."""
+        n_rim = _whole_packets(len(self.points) - len(self.vane_widths))
+        values = np.empty(len(wave), dtype=np.complex64)
+        parts = np.empty((len(wave) if slopes else 0, 2, 2 * pieces.shape[1]), dtype=np.float32)
+        frequencies = (warp_array(v, wp.float32) for v in (baseline, wave, pieces))
+        results = warp_array(values, wp.float32), warp_array(parts, wp.float32)
+        launch(sum_strips, len(wave), [*frequencies, n_rim, *results], threads=1)
+        return values, parts
 
 
-@dataclass(frozen=True)
-class _Strips:
-    """Strips along rims at some frequencies.
-
-    Attributes
-    ----------
-    piece : slice
-        The frequencies.
-    wave : ndarray, shape [n_frequency, 2]
-        Their wave vectors [rad/m].
-    light : ndarray, shape [n_frequency, n]
-        Fractions of the light in the strips, negative; of vanes over their width.
-    width, lean, phase : ndarray, shape [n_frequency, n]
-        Widths of the strips [m], phase of their middles against the rim, and phase there [rad].
-    most : float
-        A bound of the lean [rad].
-    wide : bool
-        Whether strips are so wide that the curvature of the rim, and changes of the lean, matter.
-    rims : int
-        Number of the pieces before those of vanes.
-    vane_widths : ndarray, shape [n - rims]
-        Widths of these [m].
-    """
-
-    piece: slice
-    wave: np.ndarray
-    light: np.ndarray
-    width: np.ndarray
-    lean: np.ndarray
-    phase: np.ndarray
-    most: float
-    wide: bool
-    rims: int
-    vane_widths: np.ndarray
-
-    def amplitude(self) -> np.ndarray:
-        """Return the light of the strips by the mean of its waves, those of vanes together, [n_frequency, n].
-
-        Shadows of a vane at both ends of the baseline take light, but the vane none where it is between them.
-        """
-        light = self.light * self.mean()
-        if len(self.vane_widths):
-            lean, width = (v[:, self.rims :] for v in (self.lean, self.width))
-            shadows = (2.0 * np.cos(2.0 * lean) - np.float32(1.0)) * self.vane_widths
-            shadows -= np.maximum(self.vane_widths - 2.0 * width, 0.0)
-            light[:, self.rims :] = self.light[:, self.rims :] * shadows
-        return light
-
-    def amplitude_slope(self) -> np.ndarray:
-        """Return the derivatives of these by the lean."""
-        slope = self.light * self.mean_slope()
-        if len(self.vane_widths):
-            vanes = np.s_[:, self.rims :]
-            slope[vanes] = np.float32(-4.0) * self.light[vanes] * np.sin(2.0 * self.lean[vanes]) * self.vane_widths
-        return slope
-
-    def mean(self) -> np.ndarray:
-        """Return the means of the waves over the strips, over those at their middles."""
-        terms = next((n for n, most in enumerate(_SERIES, 1) if self.most < most), 0)
-        if not terms:
-            return np.sinc(self.lean / np.float32(math.pi))
-        square = self.lean * self.lean
-        mean = square * _SINC[terms - 1]
-        for coefficient in _SINC[: terms - 1][::-1]:
-            mean += coefficient
-            mean *= square
-        mean += np.float32(1.0)
-        return mean
-
-    def mean_slope(self) -> np.ndarray:
-        """Return the derivatives of these by the lean."""
-        small = np.abs(self.lean) < _SMALL_LEAN
-        lean = np.where(small, np.float32(1.0), self.lean)
-        return np.where(small, self.lean / np.float32(-3.0), (np.cos(lean) - np.sin(lean) / lean) / lean)
+def _whole_packets(count: int) -> int:
+    """Return the least number of pieces that are whole packets and as many or more."""
+    return -(-count // LANES) * LANES
 
 
 def strip_overlap(baseline: np.ndarray, diameter: float, obscuration: float) -> np.ndarray:

@@ -26,8 +26,9 @@ _AROUND = 2048
 _WIDEST_VANE = 0.05
 #: Distance of shadows on neighbouring rings over that of the rings, up to which they are of one vane.
 _SLANTED = 2.0
-#: Divisions in two that find where light ends between two points.
-_DIVISIONS = 10
+#: Times that the way between two points is divided to find where light ends, and parts of each division.
+_DIVISIONS = 3
+_PARTS = 10
 
 
 @dataclass(frozen=True)
@@ -73,10 +74,9 @@ def scanned_edges(telescope: Telescope, direction: np.ndarray, unit: np.ndarray,
     if not shining.any():
         return edges
     first, last = status.argmax(axis=0), _ALONG - 1 - status[::-1].argmax(axis=0)
-    step = reach / _ALONG
-    for side, (inside, outward) in enumerate(((first, -step), (last, step))):
-        clear = radii[inside]
-        edges[:, side] = _divided(lambda radius: lit(radius[:, None] * unit), clear, clear + outward)
+    clear = radii[np.stack([first, last])]
+    outward = reach / _ALONG * np.array([[-1.0], [1.0]])
+    edges[:] = _divided(lambda radius: lit(radius[..., None] * unit), clear, clear + outward).T
     edges[:, 0] = np.where(first == 0, 0.0, np.maximum(edges[:, 0], 0.0))
     spokes = np.arange(len(unit))
     inner, outer = (np.interp(spokes, spokes[shining], edges[shining, side], period=len(unit)) for side in (0, 1))
@@ -97,7 +97,7 @@ def scanned_vanes(telescope: Telescope, direction: np.ndarray, edges: np.ndarray
     def at(radius: np.ndarray, angle: np.ndarray) -> np.ndarray:
         return np.asarray(np.expand_dims(radius, -1) * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
 
-    status = lit(at(*np.broadcast_arrays(radii[:, None], angles)))
+    status = lit(at(radii[:, None], angles))
     ring, begin, end = _dark_runs(status)
     spoke = np.rint(0.5 * (begin + end) / _AROUND * len(edges) - 0.5).astype(np.int64) % len(edges)
     radius = radii[ring]
@@ -106,8 +106,8 @@ def scanned_vanes(telescope: Telescope, direction: np.ndarray, edges: np.ndarray
     vane &= (end - begin) * step * radius < _WIDEST_VANE * telescope.pupil_diameter
     ring, begin, end, radius = (v[vane] for v in (ring, begin, end, radius))
     # From the last lit point before the shadow, and from the first one after it, into it.
-    low = _divided(lambda angle: lit(at(radius, angle)), step * (begin - 1.0), step * begin)
-    high = _divided(lambda angle: lit(at(radius, angle)), step * (end + 1.0), step * end)
+    clear, dark = step * np.stack([begin - 1.0, end + 1.0]), step * np.stack([begin, end])
+    low, high = _divided(lambda angle: lit(at(radius, angle)), clear, dark)
     middle = points_of_plane(telescope, direction, wavelength, at(radius, 0.5 * (low + high)))
     chord = points_of_plane(telescope, direction, wavelength, at(radius, high)) - points_of_plane(
         telescope, direction, wavelength, at(radius, low)
@@ -141,22 +141,22 @@ class _Lit:
 
 
 def _divided(lit: Callable[[np.ndarray], np.ndarray], clear: np.ndarray, dark: np.ndarray) -> np.ndarray:
-    """Return where light ends between coordinates that are clear and dark [n]; ``lit`` takes coordinates [n]."""
-    for _ in range(_DIVISIONS if len(clear) else 0):
-        middle = 0.5 * (clear + dark)
-        passes = lit(middle)
-        clear, dark = np.where(passes, middle, clear), np.where(passes, dark, middle)
+    """Return where light first ends between coordinates that are clear and dark [...]; ``lit`` takes such ones."""
+    for _ in range(_DIVISIONS if clear.size else 0):
+        part = (dark - clear) / _PARTS
+        inner = clear + part * np.arange(1, _PARTS).reshape(-1, *[1] * clear.ndim)
+        clear = clear + part * np.cumprod(lit(inner), axis=0).sum(axis=0)
+        dark = clear + part
     return 0.5 * (clear + dark)
 
 
 def _dark_runs(status: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return ring, first and last number of the runs of dark points on rings [n_ring, n]; the last may pass n."""
-    starts = status & ~np.roll(status, -1, axis=1)
-    ring, begin = np.nonzero(starts)
-    begin = begin + 1
-    end = begin.copy()
-    running = np.ones(len(ring), dtype=bool)
-    while running.any():
-        running &= ~status[ring, (end + 1) % status.shape[1]]
-        end = end + running
-    return ring, begin, end
+    following = np.roll(status, -1, axis=1)
+    ring, begin = np.nonzero(status & ~following)
+    begin, last = begin + 1, np.nonzero(~status & following)[1]
+    # A ring has as many first points as last ones; its first last point may be that of its last run.
+    count = np.bincount(ring, minlength=len(status))
+    first = (np.cumsum(count) - count)[ring]
+    number = np.arange(len(ring)) - first + (last[first] < begin[first])
+    return ring, begin, last[first + number % count[ring]] + status.shape[1] * (number // count[ring])

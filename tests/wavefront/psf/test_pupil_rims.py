@@ -149,7 +149,7 @@ def test_strips_are_what_a_pupil_out_of_focus_lacks(name, field_deg, slope, left
         assert abs(transfer - expected) < left
 
 
-@pytest.mark.parametrize(("name", "small"), [("lsst_v3.3_r", 0.0), ("auxtel", 1.0)])
+@pytest.mark.parametrize(("name", "small"), [("lsst_v3.3_r", 0.0), ("auxtel", 1.0), ("decam", 0.3)])
 def test_slopes_of_the_transfer_are_central_differences(name, small):
     rims = pupil_rims(pachon.load_telescope(name), np.array([0.0, 0.0, -1.0]), WAVE)
     rng = np.random.default_rng(4)
