@@ -34,7 +34,7 @@ import pachon
 PIXEL = 10e-6
 OUTER, INNER = 4.18, 2.5498
 NOLL = np.arange(4, 23)
-AIR = pachon.models.Air(69328.0, 293.15, 1067.0, formula="filippenko")
+AIR = pachon.Air(69328.0, 293.15, 1067.0, formula="filippenko")
 #: Double Zernikes of danish's tests: term over the field, term over the pupil.
 DOUBLE = ((1, 4), (2, 4), (3, 4), (2, 5), (3, 5), (2, 6), (3, 6), *((1, j) for j in range(7, 23)))
 #: Geometry of the obstructions that danish's tests take for each set.

@@ -22,7 +22,7 @@ import pachon
 
 NOLL = slice(4, 23)
 #: Air of batoid's LSST when the donuts were made: their Z4 to Z22 of the design are those in it within 0.5 nm.
-AIR = pachon.models.Air(69328.0, 293.15, 1067.0, formula="filippenko")
+AIR = pachon.Air(69328.0, 293.15, 1067.0, formula="filippenko")
 
 
 def main() -> None:

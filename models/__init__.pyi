@@ -33,7 +33,6 @@ from .layer_stack import CoatingTable as CoatingTable
 from .layer_stack import LayerStack as LayerStack
 from .links import Pickup as Pickup
 from .links import Solve as Solve
-from .media.air import Air as Air
 from .media.dispersion import Dispersion as Dispersion
 from .media.dispersion import model_glass as model_glass
 from .media.medium import ChangedIndex as ChangedIndex

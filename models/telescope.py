@@ -361,7 +361,7 @@ class Telescope(Pictured):
         ----------
         medium : Medium
             What takes the place of `medium_before`, there and behind surfaces that have the same, such as
-            ``pachon.models.Air(69328.0, 293.15)``.
+            ``pachon.Air(69328.0, 293.15)``.
         """
         surfaces = (
             replace(s, medium_after=medium) if s.medium_after == self.medium_before else s for s in self.surfaces

@@ -228,7 +228,7 @@ def test_an_angle_of_the_rotator_that_is_no_number_is_refused(angle):
 def test_a_telescope_in_air_is_the_one_described_in_air():
     """LSST's lens table in the air of the one with baffles, which states it: spherical aberration changes by 4 nm."""
     stated = load_telescope("lsst_v3.3_r_obstructed")
-    assert stated.medium_before == pachon.models.Air(69328.0, 293.15, 1067.0, formula="filippenko")
+    assert stated.medium_before == pachon.Air(69328.0, 293.15, 1067.0, formula="filippenko")
     field = np.deg2rad([[1.2, 0.5]])
     vacuum, in_air, expected = (
         wavefront_zernikes(telescope, field, 620e-9, jmax=22).coefficients[0]
