@@ -52,6 +52,9 @@ _MASKED = 0.4
 _DARK = 0.01
 #: Sizes of donuts over that of the telescope's own between which nothing is said of them: by 120 um of 1500 of defocus.
 _SIZES = (0.92, 1.08)
+#: Largest part of the light that rims which have run away make less than none: a star in focus, for which the fit moved
+#: the rim of M2 by 3 m, has 0.07.
+_NEGATIVE = 0.03
 
 
 @dataclass(frozen=True)
@@ -242,6 +245,8 @@ def _finished(
         flags |= DonutFlag.BLENDED
     if not (finest.solution.converged and np.isfinite(finest.model).all()):
         return StarFit(flags | DonutFlag.NOT_CONVERGED, finest)
+    if _negative_light(finest.stamp, finest.solution) > _NEGATIVE:
+        return StarFit(DonutFlag.NO_DONUT)
     lost = fitter.lost_light(finest.full, finest.solution)
     if lost.any_pixel > _LOST:
         return StarFit(DonutFlag.MOSTLY_LOST)
@@ -449,6 +454,11 @@ def _misfit(stamp: Stamp, solution: Solution) -> float:
 
 def _is_between(value: float, limits: tuple[float, float]) -> bool:
     return limits[0] < value < limits[1]
+
+
+def _negative_light(stamp: Stamp, solution: Solution) -> float:
+    """Return the light that points have less than none, where rims have run away: light is linear in their places."""
+    return -float(np.minimum(stamp.rays.weights(solution.waves[0]), 0.0).sum())
 
 
 def _size(stamp: Stamp, solution: Solution) -> float:
