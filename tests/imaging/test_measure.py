@@ -89,8 +89,8 @@ def test_stars_of_images_have_honest_noise(image, catalogue):
     at = {(x + 1200, y + 1100) for x, y in catalogue.stars.positions}
     assert at >= set(zip(stars.x, stars.y, strict=True))
     assert len(stars) > 0.9 * len(at)
-    # About a cubic trend stars scatter by their noise: the PSF of a long exposure is smooth on 0.3 of a CCD, but for the
-    # CCD's height, which adds a fifth to the scatter of sizes about a quadratic one.
+    # About a cubic trend stars scatter by their noise: the PSF of a long exposure is smooth on 0.3 of a CCD, but for
+    # the CCD's height, which adds a fifth to the scatter of sizes about a quadratic one.
     u, v = (stars.x - 1800.0) / 600.0, (stars.y - 1650.0) / 600.0
     terms = np.stack([u**i * v**j for i in range(4) for j in range(4 - i)], axis=1)
     # One image tells a tenth.
