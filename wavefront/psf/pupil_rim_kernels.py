@@ -40,8 +40,6 @@ _STRIPS = f"""
     const float b_x = baseline.data[2 * frequency], b_y = baseline.data[2 * frequency + 1];
     const float k_x = wave.data[2 * frequency], k_y = wave.data[2 * frequency + 1];
     const float eighth = 0.125f * (b_x * b_x + b_y * b_y);
-    // No strip is wider than half the baseline; narrow ones are straight, and all wavefronts lean alike across them.
-    const float bent = 2.0f * eighth > narrow * narrow ? 1.0f : 0.0f;
     const bool slopes = parts.shape[0] > 0;
     packet real_sum = {{}}, imaginary_sum = {{}};
     for (int i = 0; i < n; i += {LANES}) {{
@@ -66,9 +64,9 @@ _STRIPS = f"""
             const packet mean_slope = (square < 0.25f)
                 ? lean * (-1.0f / 3.0f + square * (1.0f / 30.0f - square * (1.0f / 840.0f)))
                 : (cosine_lean - quotient) / divisor;
-            const packet strip = -part * (width + bent * PIECE(7) * (eighth - width * width));
+            const packet strip = -part * (width + PIECE(7) * (eighth - width * width));
             light = strip * mean;
-            change = 0.5f * bent * width * strip * mean_slope;
+            change = 0.5f * width * strip * mean_slope;
         }} else {{
             // Shadows of a vane at both ends of the baseline take light, but the vane none where it is between them.
             const packet twice = 2.0f * lean;
@@ -84,7 +82,7 @@ _STRIPS = f"""
         imaginary_sum = imaginary_sum + imaginary;
         if (slopes) {{
             // What the phase changes across a strip goes with that of its middle, and changes the mean.
-            const packet half = (i < n_rim) ? 0.5f * bent * width : packet{{}};
+            const packet half = (i < n_rim) ? 0.5f * width : packet{{}};
             float* out = parts.data + 4LL * n * frequency + i;
             *(packet*)out = imaginary;
             *(packet*)(out + n) = change * cosine_phase + half * imaginary;
@@ -108,7 +106,6 @@ def add_strips(
     wave: wp.array2d(dtype=wp.float32),
     pieces: wp.array2d(dtype=wp.float32),
     n_rim: wp.int32,
-    narrow: wp.float32,
     frequency: wp.int32,
     values: wp.array2d(dtype=wp.float32),
     parts: wp.array3d(dtype=wp.float32),
@@ -124,16 +121,14 @@ def sum_strips(
     wave: wp.array2d(dtype=wp.float32),
     pieces: wp.array2d(dtype=wp.float32),
     n_rim: wp.int32,
-    narrow: wp.float32,
     values: wp.array2d(dtype=wp.float32),
     parts: wp.array3d(dtype=wp.float32),
 ):
     """Add the waves of the strips at one frequency, the item.
 
     Arguments: baseline, wave [frequency, 2]: baselines in the pupil [m] and wave vectors of the image [rad/m]; pieces
-    [PIECE_NUMBERS, piece]: whole packets of rims, of which there are n_rim, then of vanes; narrow: width of strips [m]
-    up to which they are straight. Results: values [frequency, 2]: real and imaginary parts; parts [frequency, 2, 2 *
-    piece], or empty: derivatives of the real and of the imaginary part by the phases of the pieces, and by halves of
-    the changes of the phase per metre.
+    [PIECE_NUMBERS, piece]: whole packets of rims, of which there are n_rim, then of vanes. Results: values
+    [frequency, 2]: real and imaginary parts; parts [frequency, 2, 2 * piece], or empty: derivatives of the real and of
+    the imaginary part by the phases of the pieces, and by halves of the changes of the phase per metre.
     """
-    add_strips(baseline, wave, pieces, n_rim, narrow, first + wp.tid(), values, parts)
+    add_strips(baseline, wave, pieces, n_rim, first + wp.tid(), values, parts)

@@ -43,8 +43,6 @@ from .sample_packets import LANES
 PIECES = 192
 # Curvature of a rim, over that of the pupil's own, up to which it is no corner.
 _MOST_CURVED = 5.0
-# Width of strips over the radius of the pupil up to which the rim is straight along them and all wavefronts lean alike.
-_NARROW = 0.05
 # Frequencies at a time: their strips take some 30 MB.
 _CHUNK = 4096
 
@@ -151,8 +149,7 @@ class PupilRims:
         parts = np.empty((len(wave) if slopes else 0, 2, 2 * pieces.shape[1]), dtype=np.float32)
         frequencies = (warp_array(v, wp.float32) for v in (baseline, wave, pieces))
         results = warp_array(values, wp.float32), warp_array(parts, wp.float32)
-        narrow = _NARROW * float(np.abs(self.points).max(initial=0.0))
-        launch(sum_strips, len(wave), [*frequencies, n_rim, narrow, *results], threads=1)
+        launch(sum_strips, len(wave), [*frequencies, n_rim, *results], threads=1)
         return values, parts
 
 
