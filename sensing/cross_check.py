@@ -85,10 +85,11 @@ def cross_checked(
         # What donuts share of the air is no part of the scatter.
         scale = _scale_of_air(scatter, others, _AIR_OF_ITS_OWN * in_air, _INDEPENDENT * freedom)
         of_group = set(group.tolist())
-        air_of_each = [scale * (common if i in of_group else errors.air) for i, errors in enumerate(parts)]
         checked = [
-            ErrorParts.of(errors.photons, errors.residuals, scaled, errors.floor)
-            for errors, scaled in zip(parts, air_of_each, strict=True)
+            ErrorParts.of(
+                errors.photons, errors.residuals, scale * (common if i in of_group else errors.air), errors.floor
+            )
+            for i, errors in enumerate(parts)
         ]
         lacking = residuals + scale * _AIR_OF_ITS_OWN * in_air
     excess = scatter - noise - lacking
