@@ -49,7 +49,7 @@ _STRIPS = f"""
         const packet lean = (k_x * PIECE(4) + k_y * PIECE(5)) * width;
         const packet part = PIECE(6), thick = PIECE(8);
         packet phase = k_x * PIECE(2) + k_y * PIECE(3);
-        packet light, change;
+        packet light, aside = {{}}, change, change_aside = {{}};
         if (i < n_rim) {{
             phase = phase + lean;
             {_SINE_AND_COSINE.format(name="lean")}
@@ -64,9 +64,16 @@ _STRIPS = f"""
             const packet mean_slope = (square < 0.25f)
                 ? lean * (-1.0f / 3.0f + square * (1.0f / 30.0f - square * (1.0f / 840.0f)))
                 : (cosine_lean - quotient) / divisor;
-            const packet strip = -part * (width + PIECE(7) * (eighth - width * width));
-            light = strip * mean;
-            change = 0.5f * width * strip * mean_slope;
+            const packet mean_bend = (square < 0.25f)
+                ? -1.0f / 3.0f + square * (0.1f - square * (1.0f / 168.0f))
+                : -mean - 2.0f * mean_slope / divisor;
+            // What a bent rim adds lies at the inner end of the strip, and what it lacks grows towards that.
+            const packet deeper = PIECE(7) * (eighth - 0.5f * width * width);
+            const packet shorter = 0.5f * PIECE(7) * width * width;
+            light = -part * ((width - shorter) * mean + deeper * cosine_lean);
+            aside = part * (deeper * sine_lean + shorter * mean_slope);
+            change = -0.5f * width * part * ((width - shorter) * mean_slope - deeper * sine_lean);
+            change_aside = 0.5f * width * part * (deeper * cosine_lean + shorter * mean_bend);
         }} else {{
             // Shadows of a vane at both ends of the baseline take light, but the vane none where it is between them.
             const packet twice = 2.0f * lean;
@@ -77,7 +84,8 @@ _STRIPS = f"""
             change = 2.0f * width * part * thick * sine_twice;
         }}
         {_SINE_AND_COSINE.format(name="phase")}
-        const packet real = light * cosine_phase, imaginary = -light * sine_phase;
+        const packet real = light * cosine_phase + aside * sine_phase;
+        const packet imaginary = aside * cosine_phase - light * sine_phase;
         real_sum = real_sum + real;
         imaginary_sum = imaginary_sum + imaginary;
         if (slopes) {{
@@ -85,9 +93,9 @@ _STRIPS = f"""
             const packet half = (i < n_rim) ? 0.5f * width : packet{{}};
             float* out = parts.data + 4LL * n * frequency + i;
             *(packet*)out = imaginary;
-            *(packet*)(out + n) = change * cosine_phase + half * imaginary;
+            *(packet*)(out + n) = change * cosine_phase + change_aside * sine_phase + half * imaginary;
             *(packet*)(out + 2 * n) = -real;
-            *(packet*)(out + 3 * n) = -change * sine_phase - half * real;
+            *(packet*)(out + 3 * n) = change_aside * cosine_phase - change * sine_phase - half * real;
         }}
     }}
     float real_part = 0.0f, imaginary_part = 0.0f;

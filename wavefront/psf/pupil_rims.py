@@ -6,14 +6,14 @@ about which both :math:`p \pm b/2` are clear: the clear pupil less a strip along
 diffraction changes these and leaves what lies between them as rays have it. For pieces of rim of length l, with strips
 of width :math:`w = |b \cdot n| / 2`,
 
-.. math:: -\frac{1}{A} \sum \left[w + c \left(\frac{b^2}{8} - w^2\right)\right] l \,
-   \frac{\sin h}{h} \, e^{-i (\kappa \cdot x + h)}, \qquad h = \frac{w}{2} \kappa \cdot m
+.. math:: -\frac{1}{A} \sum l \, e^{-i (\kappa \cdot x + h)} \left[w S + c \left(\frac{b^2}{8} - \frac{w^2}{2}\right)
+   e^{-i h} - \frac{c w^2}{2} (S + i S')\right], \qquad h = \frac{w}{2} \kappa \cdot m, \quad S = \frac{\sin h}{h}
 
 is added to the transform of the rays' image: :math:`\kappa` is the wave vector of the image, x the place where the
 light of the rim lands, and m the change of this place per metre towards the lit side. The phase is that of the middle
-of the strip, and its sinc the mean over the strip, which matters on a small pupil of long focal length: without it
-strips of AuxTel are wrong by as much as they are. A rim of curvature c, positive where the lit side is convex, has
-strips that are wider and shorter than those of a straight one.
+of the strip, and S the mean over the strip, which matters on a small pupil of long focal length: without it strips of
+AuxTel are wrong by as much as they are. A rim of curvature c, positive where the lit side is convex, has strips that
+are wider, at their inner ends, and shorter the further in than those of a straight one.
 
 A vane of width t has its shadow at both ends of the baseline, and where it stands itself, between them, light is not
 lost: :math:`w` and the sinc give way to :math:`(2 \cos 2h' - 1)\, t - \max(t - 2w, 0)` with :math:`2h' = w\, \kappa
@@ -190,7 +190,7 @@ def pupil_rims(telescope: Telescope, direction: np.ndarray, wavelength: float, p
         # Where a spoke is dark its two ends are one point, and no light passes between them.
         shining = (edges[:, 1] > edges[:, 0]) & (length > 0.0)
         across = np.stack([along[:, 1], -along[:, 0]], axis=-1)[shining] / length[shining, None]
-        curved = sign * (along[:, 0] * bend[:, 1] - along[:, 1] * bend[:, 0])[shining] / length[shining] ** 3
+        curved = -sign * (along[:, 0] * bend[:, 1] - along[:, 1] * bend[:, 0])[shining] / length[shining] ** 3
         # Corners, where one rim begins to vignette, count as what curves most.
         curved = np.clip(curved, -_MOST_CURVED / reach, _MOST_CURVED / reach)
         pieces_of_rims.append((rim[shining], sign * across, length[shining], curved))

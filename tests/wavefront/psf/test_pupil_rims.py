@@ -25,8 +25,8 @@ def defocused():
 @pytest.fixture(scope="module")
 def donut(defocused):
     """Donut on the axis from the autocorrelation of the waves in its pupil, times the mean of turbulence, unit sum."""
-    step, reach = 8e-3, 75  # of the pupil, and baselines up to 0.6 m
-    size = scipy.fft.next_fast_len(1046 + reach)
+    step, reach = 4e-3, 150  # of the pupil: twice the stamp; baselines up to 0.6 m
+    size = scipy.fft.next_fast_len(2092 + reach)
     place = (np.arange(size) - size // 2) * step
     x, y = np.meshgrid(place, place)
     radius, outer = np.hypot(x, y), 0.5 * LSST.pupil_diameter
@@ -60,7 +60,7 @@ def test_long_exposure_donuts_are_diffracted_at_their_rims(defocused, donut):
         defocused, [(0.0, 0.0)], [WAVE], atmosphere=AIR, engine="long_exposure", stamps=Stamps(SIDE, diffusion=0.0)
     ).image[0]
     # Without diffraction, or with one filter for all rays, 4 %: what is left is the third order of the strips' width.
-    assert difference(image / image.sum(), donut) < 0.01
+    assert difference(image / image.sum(), donut) < 0.003
 
 
 @pytest.mark.slow
@@ -72,8 +72,8 @@ def test_fits_with_diffraction_find_no_wavefront_in_it(defocused, donut):
     )
     # Rays and a wider seeing do not make strips along the rims: 24 nm of Z11, at 0.6 mm.
     assert np.linalg.norm(plain.zernikes[0]) > 15e-9
-    assert np.linalg.norm(right.zernikes[0]) < 4e-9
-    assert right.chi2[0] < 0.1 * plain.chi2[0]
+    assert np.linalg.norm(right.zernikes[0]) < 2e-9
+    assert right.chi2[0] < 0.03 * plain.chi2[0]
 
 
 @pytest.mark.slow
@@ -101,7 +101,10 @@ def test_strips_of_a_ring_are_its_transfer_function_to_first_order():
     nothing = np.zeros((len(rims.points), 2))
     found = rims.transfer(baseline, np.zeros((2, 2)), nothing, nothing)
     assert found == pytest.approx(-0.01 * 2.0 * (outer + inner) / area, rel=1e-3)
-    assert (rims.normals * rims.points).sum(axis=1)[: len(rims.points) // 2].min() > 0.0  # the hole first
+    hole = slice(len(rims.points) // 2)
+    assert (rims.normals * rims.points).sum(axis=1)[hole].min() > 0.0
+    np.testing.assert_allclose(rims.curvatures[hole], -1.0 / inner, rtol=1e-3)
+    np.testing.assert_allclose(rims.curvatures[hole.stop :], 1.0 / outer, rtol=1e-3)
 
 
 def test_a_straight_strip_is_the_integral_of_its_waves():
@@ -114,13 +117,30 @@ def test_a_straight_strip_is_the_integral_of_its_waves():
     assert found == pytest.approx(-0.3 * 0.1 * np.exp(-1j * places @ wave[0]).mean(), rel=1e-5)
 
 
+def test_strips_of_a_disc_are_what_its_shifted_copies_lack():
+    """Against quadrature along radii of a disc like AuxTel's, whose light is turned by several radians across a strip."""
+    angle, radius, slope = 2.0 * np.pi * (np.arange(512) + 0.5) / 512, 0.6, 7.5e-5
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    piece = np.full(512, 2.0 * np.pi / (512 * np.pi * radius))
+    rims = PupilRims(radius * unit, -unit, piece, np.full(512, 1.0 / radius))
+    for width in (0.05, 0.1, 0.15):
+        baseline, wave = np.array([[width, 0.0]]), np.array([[2.0 * np.pi / WAVE * width, 0.0]])
+        found = rims.transfer(baseline, wave, slope * rims.points, -slope * unit)[0]
+        end = np.sqrt(radius**2 - (0.5 * width * unit[:, 1]) ** 2) - 0.5 * width * np.abs(unit[:, 0])
+        along = end[:, None] + (radius - end)[:, None] * (np.arange(400) + 0.5) / 400
+        waves = along * np.cos(slope * wave[0, 0] * along * unit[:, :1])
+        lost = (waves.mean(axis=1) * (radius - end)).mean() * 2.0 * np.pi
+        # What is left is of third order in the width.
+        assert found == pytest.approx(-lost / (np.pi * radius**2), abs=4e-5)
+
+
 @pytest.mark.parametrize(
     ("name", "field_deg", "slope", "left"),
     [
         ("auxtel", (0.0, 0.0), 7.5e-5, 4e-3),
-        ("lsst_v3.3_r", (0.0, 0.0), 1.45e-5, 6e-4),
+        ("lsst_v3.3_r", (0.0, 0.0), 1.45e-5, 3e-4),
         # Vanes narrower than the baselines, and a plate; without them, 0.05.
-        ("decam", (0.5, 0.4), 1.2e-5, 4e-3),
+        ("decam", (0.5, 0.4), 1.2e-5, 1.5e-3),
     ],
 )
 def test_strips_are_what_a_pupil_out_of_focus_lacks(name, field_deg, slope, left):
