@@ -118,7 +118,7 @@ def test_a_straight_strip_is_the_integral_of_its_waves():
 
 
 def test_strips_of_a_disc_are_what_its_shifted_copies_lack():
-    """Against quadrature along radii of a disc like AuxTel's, whose light is turned by several radians across a strip."""
+    """Against quadrature along radii of a disc like AuxTel's, whose light turns by radians across a strip."""
     angle, radius, slope = 2.0 * np.pi * (np.arange(512) + 0.5) / 512, 0.6, 7.5e-5
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     piece = np.full(512, 2.0 * np.pi / (512 * np.pi * radius))
