@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from .hierarchy import GROUND
-from .star_errors import ErrorParts
+from .light import Instrument
+from .star_errors import ErrorParts, air_of_terms, star_errors
+from .star_fitter import StarSolution
 
 #: Least number of donuts for wavefronts that are linear over the field.
 _FOR_LINEAR = 6
@@ -24,12 +27,30 @@ _MOST_SCATTER = 150e-9
 _WHERE_SEEN = 0.5
 #: Fraction of the air's variance that stars do not share.
 _AIR_OF_ITS_OWN = 1.0 - GROUND
-#: Standard deviation of the logarithm of the air's variance about that which residuals say.
-_AIR_SPREAD = 1.0
+#: Least rms of the air's wavefront about which its prior lies, whatever the residuals say [m].
+_LEAST_AIR = 20e-9
+#: Standard deviation of the logarithm of its variance.
+_AIR_SPREAD = 2.0
 #: Standard deviations by which the scatter is larger than claimed, to be more than chance.
 _SIGNIFICANT = 2.0
 #: Independent errors of a wavefront: few combinations have most of the variance.
 _INDEPENDENT = 5.0
+
+
+def checked_parts(instrument: Instrument, stars: Sequence[StarSolution], fields: np.ndarray) -> list[ErrorParts]:
+    """Return the errors of stars that were fitted each by itself, after :func:`cross_checked`.
+
+    ``fields`` has their field angles [rad], shape [n, 2].
+    """
+    n = len(instrument.terms.requested)
+    return cross_checked(
+        fields / instrument.telescope.field_radius,
+        np.array([star.solution.shared[:n] for star in stars]).reshape(-1, n),
+        [star_errors(instrument, star).parts for star in stars],
+        np.array([star.light.depth > 0.0 for star in stars], dtype=bool),
+        partial(air_of_terms, instrument),
+        measured_air=instrument.model.air.atmosphere is None,
+    )
 
 
 def cross_checked(
@@ -78,20 +99,20 @@ def cross_checked(
     )
     # All of them have looked through one air, of which the residuals of one donut say little.
     common = np.mean([parts[i].air for i in group], axis=0)
-    in_air = freedom * float(np.trace(common))
-    lacking = residuals + in_air
-    if measured_air and in_air > 0.0 and scatter < most + noise + lacking:
-        others = noise + residuals
+    told = float(np.trace(common))
+    lacking = residuals + freedom * told
+    # Donuts near each other may differ by anything, donuts over the field by the air if the residuals do not say why.
+    middle = told if terms == 1 else max(told, _LEAST_AIR**2)
+    if measured_air and middle > 0.0 and scatter < most + noise + lacking:
         # What donuts share of the air is no part of the scatter.
-        scale = _scale_of_air(scatter, others, _AIR_OF_ITS_OWN * in_air, _INDEPENDENT * freedom)
-        of_group = set(group.tolist())
-        checked = [
-            ErrorParts.of(
-                errors.photons, errors.residuals, scale * (common if i in of_group else errors.air), errors.floor
-            )
-            for i, errors in enumerate(parts)
-        ]
-        lacking = residuals + scale * _AIR_OF_ITS_OWN * in_air
+        own = _AIR_OF_ITS_OWN * freedom
+        variance = _air_variance(scatter, noise + residuals, own, middle, _INDEPENDENT * freedom)
+        of_air = min(variance / told, 1.0) * common if told > 0.0 else common
+        of_air = of_air + max(variance - told, 0.0) * air()
+        for i in group:
+            errors = parts[i]
+            checked[i] = ErrorParts.of(errors.photons, errors.residuals, of_air, errors.floor)
+        lacking = residuals + own * variance
     excess = scatter - noise - lacking
     if excess > most:
         return list(parts)
@@ -106,18 +127,19 @@ def cross_checked(
     return checked
 
 
-def _scale_of_air(scatter: float, others: float, air: float, freedom: float) -> float:
-    """Return the likeliest variance of the air over that which residuals say, by the scatter of the donuts.
+def _air_variance(scatter: float, others: float, own: float, middle: float, freedom: float) -> float:
+    """Return the likeliest variance of the air's wavefront by the scatter of the donuts.
 
-    The scatter has so many degrees of freedom; it is expected to be what all else and the air together make.
+    The scatter has so many degrees of freedom; it is expected to be what all else makes, and the variance times `own`.
+    The prior lies about the variance `middle`.
     """
 
     def loss(logarithm: float) -> float:
-        expected = others + math.exp(logarithm) * air
+        expected = others + math.exp(logarithm) * middle * own
         prior = 0.5 * (logarithm / _AIR_SPREAD) ** 2
         return prior + 0.5 * freedom * (math.log(expected) + scatter / expected)
 
-    return math.exp(float(minimize_scalar(loss, bounds=(-6.0, 6.0), method="bounded").x))
+    return middle * math.exp(float(minimize_scalar(loss, bounds=(-8.0, 8.0), method="bounded").x))
 
 
 def _noise(errors: ErrorParts) -> np.ndarray:

@@ -122,7 +122,7 @@ class TelescopeFreedoms(WavefrontFit):
 
         fit = least_rims(shared_rims(instrument, usable.stars), fitted)
         stars, group, joint, rims = fit
-        errors = joint_errors(instrument, usable.stars, response.matrix[:, noll - 1], stars, group, joint)
+        errors = joint_errors(instrument, usable.stars, fields, response.matrix[:, noll - 1], stars, group, joint)
         values = joint.shared[:count]
         after = freedoms.apply(telescope, values)
         believed, estimated = (

@@ -21,9 +21,10 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
-#: Part of the air's variance that all donuts of an exposure share, in layers near the ground. It is two thirds at Cerro
-#: Pachon, and anything from 0.2 to 0.8 elsewhere: as much as gives the mean of the whole variance over their own.
-GROUND = 0.57
+#: Part of the air's variance that all donuts of an exposure share, in layers near the ground. By weights over speeds it
+#: is 0.8 at Cerro Pachon, and anything from 0.2 to 0.9 elsewhere: as much as gives the mean of the whole variance over
+#: their own.
+GROUND = 0.66
 #: Rms of the air's wavefront about which its prior lies, that of 15 s under median seeing, Z4 to Z22 [m].
 AIR_RMS = 110e-9
 #: Largest air that can be told from wavefronts that have nothing in common [m].

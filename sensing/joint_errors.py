@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .cross_check import checked_parts
 from .hierarchy import GROUND
 from .light import Instrument
 from .likelihood import linearized
@@ -41,6 +42,7 @@ class JointErrors:
 def joint_errors(
     instrument: Instrument,
     alone: Sequence[StarSolution],
+    fields: np.ndarray,
     wave_maps: Sequence[np.ndarray] | np.ndarray,
     stars: Sequence[StarSolution],
     group: Group,
@@ -54,6 +56,8 @@ def joint_errors(
         Telescope and model of the images.
     alone : sequence of StarSolution
         The stars as each was fitted by itself.
+    fields : ndarray, shape [n_star, 2]
+        Their field angles [rad].
     wave_maps : sequence of n_star ndarray, each of shape [n_wave, m]
         Wavefronts by the first m shared unknowns.
     stars, group : sequence of StarSolution, Group
@@ -73,8 +77,8 @@ def joint_errors(
     air, figure = np.zeros((2, unknowns, unknowns))
     if errors:
         common = np.sum(gains, axis=0)
-        # Residuals of one star say little of the air that all have.
-        of_air = np.mean([star_error.parts.air for star_error in errors], axis=0)
+        # Residuals of one star say little of the air that all have, and their scatter more.
+        of_air = np.mean([parts.air for parts in checked_parts(instrument, alone, fields)], axis=0)
         own = np.sum([gain @ of_air @ gain.T for gain in gains], axis=0)
         air = GROUND * common @ of_air @ common.T + (1.0 - GROUND) * own
         figure = common @ np.mean([star_error.figure for star_error in errors], axis=0) @ common.T

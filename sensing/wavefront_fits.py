@@ -6,7 +6,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -19,7 +18,7 @@ from ..models.telescope import Telescope
 from ..models.zernike_polynomials import annular_zernikes
 from ..raytrace.rays import Projection
 from ..wavefront.atmosphere.atmosphere import Atmosphere
-from .cross_check import cross_checked
+from .cross_check import checked_parts
 from .degrees import FreedomEstimate
 from .exposure import ExposureWavefront
 from .fit_star import StarFit
@@ -39,7 +38,7 @@ from .shared_rims import (
     with_shared_rims,
 )
 from .solve import Solution, solve
-from .star_errors import ErrorParts, air_of_terms, model_floor, star_errors, with_errors
+from .star_errors import ErrorParts, model_floor, star_errors, with_errors
 from .star_fitter import StarSolution
 from .terms import WavefrontTerms
 
@@ -215,15 +214,8 @@ class SingleDonuts(WavefrontFit):
         """Return the results of the stars as each fit has them."""
         instrument, n = usable.instrument, len(usable.instrument.terms.requested)
         errors = [star_errors(instrument, star) for star in usable.stars]
-        zernikes = np.array([star.solution.shared[:n] for star in usable.stars]).reshape(-1, n)
-        parts = cross_checked(
-            usable.fields / instrument.telescope.field_radius,
-            zernikes,
-            [star_error.parts for star_error in errors],
-            np.array([star.light.depth > 0.0 for star in usable.stars], dtype=bool),
-            partial(air_of_terms, instrument),
-            measured_air=instrument.model.air.atmosphere is None,
-        )
+        zernikes = [star.solution.shared[:n] for star in usable.stars]
+        parts = checked_parts(instrument, usable.stars, usable.fields)
         return FittedStars(
             [
                 FittedStar(star.full, star.model, star.solution.stars[0], star_error.covariance, wavefront, causes)
@@ -299,7 +291,7 @@ class FieldTerms(WavefrontFit):
         stars, group, solution, _ = fit
         n = len(instrument.terms.requested)
         requested = (n_noll * np.arange(n_field)[:, None] + np.arange(n)).ravel()
-        errors = joint_errors(instrument, usable.stars, wave_maps, stars, group, solution)
+        errors = joint_errors(instrument, usable.stars, usable.fields, wave_maps, stars, group, solution)
         shared_covariance = solution.shared_covariance + errors.shared
         return FittedStars(
             joint_results(
