@@ -50,6 +50,9 @@ _OUTPUT = "Output"
 _CHOICES = "Diffraction and orientation"
 #: Field angle from which on a donut tells its orientation, as a fraction of the telescope's field.
 _OFF_AXIS = 0.25
+#: Least and greatest side of a pixel, and greatest shift of a body [um].
+_PIXELS_UM = (1.0, 1e4)
+_MOST_DEFOCUS_UM = 1e5
 #: Donuts that are enough for a check of orientation wherever they stand.
 _SEVERAL = 3
 
@@ -299,6 +302,9 @@ def donuts_command(
     from ..sensing.wavefront_fits import SingleDonuts
     from ..wavefront.atmosphere.atmosphere import Atmosphere
 
+    _require_within("--defocus-um", defocus_um, (-_MOST_DEFOCUS_UM, _MOST_DEFOCUS_UM))
+    if pixel_um is not None:
+        _require_within("--pixel-um", pixel_um, _PIXELS_UM)
     if simulate:
         name = telescope or DEFAULT_TELESCOPE
         focused = load_model(name, lenient, glass_catalogue or ())
@@ -398,6 +404,11 @@ def donuts_command(
     if orientation is not None and orientation.doubtful:
         fit = replace(fit, flags=fit.flags | checked * int(DonutFlag.ORIENTATION))
         print_warning(orientation_text(orientation, inputs))
+    if not (fit.usable.any() or model.detector.shifts(len(fit)).any()):
+        print_warning(
+            "defocus is 0 um, that of the files and --defocus-um together: stars are fitted as in focus. Of donuts, "
+            "give --defocus-um, DEFOC_UM or a column defocus_um"
+        )
     converted = fit.zernikes_in(cast("ZernikeConvention", convention), output_frame, frames=frames)
     motions = None
     if fit.degrees_of_freedom is not None:
@@ -420,6 +431,12 @@ def _electrons(gain: float | None, header: HeaderValues) -> float:
     return gain
 
 
+def _require_within(option: str, value: float, bounds: tuple[float, float]) -> None:
+    """Raise a ConfigError for a length of an option [um] beyond its bounds."""
+    if not bounds[0] <= value <= bounds[1]:
+        raise ConfigError(f"{option} = {value:g}: expected {bounds[0]:g} to {bounds[1]:g} um")
+
+
 def _pixel_um(pixel_um: float | None, stated: float | None, camera: str | None) -> float:
     """Return the side of a pixel [um]: of the option, that stated [m], of the camera, or that of the LSST."""
     from ..models.camera.cameras import load_camera
@@ -433,11 +450,14 @@ def _pixel_um(pixel_um: float | None, stated: float | None, camera: str | None) 
 
 def _output_kind(table: Path | None, picture: Path | None) -> str:
     """Return the format of the picture; a ConfigError for names of files of other formats."""
+    from ..core.files import require_writable
     from ..core.table_files import FORMATS
 
     kind = picture_kind(picture)
     if table is not None and table.suffix.lower() not in FORMATS:
         raise ConfigError(f"--out = {table}: expected a name that ends in {', '.join(FORMATS)}")
+    if table is not None:
+        require_writable(table, file=True)
     return kind
 
 
