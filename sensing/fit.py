@@ -230,7 +230,9 @@ def fit_donuts(
                 # Not the telescope's: each donut keeps the rims of its own fit.
                 refined = replace(refined, free_rims=instrument.free_rims)
                 again = fitted if refined.terms is instrument.terms else once_more(refined)
-            instrument, fitted = refined, again
+            # A refinement with which the fit of some donut does not converge would lose it.
+            if not any(DonutFlag.NOT_CONVERGED in again.stars[i].flags for i in fitted.solutions):
+                instrument, fitted = refined, again
     result = _result(instrument, observed, fitted)
     warn_of_other_hole(instrument, fitted.solutions, result)
     return result
