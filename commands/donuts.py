@@ -271,11 +271,11 @@ def donuts_command(
     A file holds a cube of stamps and a table with their fields (field_x, field_y [deg], defocus_um), one stamp an
     extension with keywords FIELD_X, FIELD_Y and DEFOC_UM, or the image of a CCD, with --positions. Of LSSTCam, ComCam,
     LATISS and DECam, and of ts_wep's DonutStamps, headers give camera, detector, pixel, angles, band and gain, and
-    extensions MASK, VARIANCE (DQ, WEIGHT) are read. Stamps have x and y along those of the camera, unless --stamp-axes
-    or the header's detector says otherwise. A defocus moves what --moved, a keyword MOVED or a column moved names, or
-    the header's camera: Camera (full-array mode of LSSTCam), M2 (AuxTel), else the detector. Bad donuts are flagged
-    with the reason. Two donuts or more are taken to be of one exposure, or of both sides of focus: they are fitted
-    together (--each-alone: not).
+    extensions MASK, VARIANCE (DQ, WEIGHT, ERR) are read. Stamps have x and y along those of the camera, unless
+    --stamp-axes or the header's detector says otherwise. A defocus moves what --moved, a keyword MOVED or a column
+    moved names, or the header's camera: Camera (full-array mode of LSSTCam), M2 (AuxTel), DECam, else the detector.
+    Bad donuts are flagged with the reason. Two donuts or more are taken to be of one exposure, or of both sides of
+    focus: they are fitted together (--each-alone: not).
 
     **Examples**
 
@@ -286,7 +286,7 @@ def donuts_command(
     - `pachon donuts corner_*.fits -t rubin_v3.14_i --degrees-of-freedom lsst --json`
     - `pachon donuts ccd.fits --positions stars.ecsv --stamp 200 --defocus-um -1500`
     - `pachon donuts donutStamps.fits --frame CCS --convention ts_wep` (as LSST's zk_deviation_CCS)
-    - `pachon donuts DECam_*.stamp.fits --defocus-um 2000 --convention donut`
+    - `pachon donuts DECam_*.stamp.fits --defocus-um 1650 --convention donut`
     - `pachon donuts stamps.fits --stamp-axes DVCS --rotator-deg 12.3 --degrees-of-freedom lsst --frame ZCS`
     """
     import numpy as np
