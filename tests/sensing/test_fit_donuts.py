@@ -519,6 +519,19 @@ def test_tables_summaries_and_pictures(behind_focus, clean):
     assert len(fit.plot().axes) >= 7
 
 
+@pytest.mark.long
+def test_pictures_of_counts_have_the_noise_of_the_fit(behind_focus, clean):
+    """Each star has its own scale from its background on, whatever the unit; the level of a bias was light before."""
+    image = noisy(clean, 500.0, 3)
+    images = [image, 0.4 * image + 1000.0]
+    fit = pachon.fit_donuts(behind_focus, images, [FIELD] * 2, WAVELENGTH, noll=range(4, 12), **OPTIONS)
+    drawn = [np.asarray(axes.images[0].get_array()) for axes in fit.plot().axes if axes.images]
+    for k in (0, 1):
+        assert np.median(drawn[k][:8]) == pytest.approx(0.0, abs=0.05)
+        assert np.percentile(drawn[k], 99.5) == pytest.approx(1.0, abs=0.01)
+        assert np.nanstd(drawn[4 + k]) == pytest.approx(np.sqrt(fit.chi2[k] / fit.n_pixels[k]), abs=0.1)
+
+
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
