@@ -296,6 +296,8 @@ def _fit_alone(
     masked = star.masked | not_finite
     saturated = _saturated(np.where(masked, 0.0, star.image), masked, instrument.model.detector.saturation)
     masked = masked | grown(saturated, ~masked)
+    if star.masked.all():
+        return StarFit(DonutFlag.MOSTLY_LOST)
     donut = light.diameter > SMALLEST_DONUT * instrument.pixel
     wavefront = not joint or donut
     fitted_once = partial(

@@ -504,6 +504,16 @@ def test_results_do_not_depend_on_threads_or_on_other_donuts(behind_focus, clean
 
 
 @pytest.mark.long
+def test_stamps_without_the_light_of_their_donuts_are_lost(behind_focus, clean):
+    """All pixels masked, and a stamp that lies within its donut: these were said to be no donuts."""
+    middle = slice(len(clean) // 2 - 10, len(clean) // 2 + 10)
+    images = [noisy(clean, 500.0, 3), noisy(clean, 500.0, 4)[middle, middle]]
+    masks = [np.ones_like(image, dtype=bool) * (k == 0) for k, image in enumerate(images)]
+    fit = pachon.fit_donuts(behind_focus, images, [FIELD] * 2, WAVELENGTH, mask=masks, **OPTIONS)
+    assert fit.reasons == ["mostly lost", "mostly lost"]
+
+
+@pytest.mark.long
 def test_tables_summaries_and_pictures(behind_focus, clean):
     images = np.stack([clean, np.full_like(clean, np.nan)])
     fit = pachon.fit_donuts(
