@@ -301,6 +301,7 @@ def donuts_command(
     from ..sensing.orientation import check_orientation
     from ..sensing.wavefront_fits import SingleDonuts
     from ..wavefront.atmosphere.atmosphere import Atmosphere
+    from ..wavefront.request import wavelength_points
 
     _require_within("--defocus-um", defocus_um, (-_MOST_DEFOCUS_UM, _MOST_DEFOCUS_UM))
     if pixel_um is not None:
@@ -364,7 +365,8 @@ def donuts_command(
     if sky_variance is not None:
         sky = [sky_variance] * len(inputs.images)
     if not quiet and header.text:
-        print_line(f"{files[0]}: {header.text} of its header; {believed.name}", error=True)
+        lengths = ", ".join(f"{1e9 * wavelength:.4g}" for wavelength in wavelength_points(believed, light))
+        print_line(f"{files[0]}: {header.text} of its header; {believed.name} at {lengths} nm", error=True)
     orientation = None
     with (
         warnings_shown(PrescriptionWarning),
@@ -388,7 +390,9 @@ def donuts_command(
         checked = fit.usable | (fit.flags & int(DonutFlag.DEFOCUS_SIGN) > 0)
         which = [int(i) for i in checked.nonzero()[0]]
         off_axis = (abs(inputs.fields[which]) > _OFF_AXIS * believed.field_radius).any()
-        if orientation_check and which and (len(which) >= _SEVERAL or off_axis):
+        as_expected = fit.usable & (fit.flags & int(DonutFlag.OTHER_SIZE) == 0)
+        defocused = bool(as_expected.any() or model.detector.shifts(len(fit)).any())
+        if orientation_check and defocused and which and (len(which) >= _SEVERAL or off_axis):
             shifts = model.detector.shifts(len(inputs.images))[which]
             orientation = check_orientation(
                 believed,
@@ -404,7 +408,7 @@ def donuts_command(
     if orientation is not None and orientation.doubtful:
         fit = replace(fit, flags=fit.flags | checked * int(DonutFlag.ORIENTATION))
         print_warning(orientation_text(orientation, inputs))
-    if not (fit.usable.any() or model.detector.shifts(len(fit)).any()):
+    if not defocused:
         print_warning(
             "defocus is 0 um, that of the files and --defocus-um together: stars are fitted as in focus. Of donuts, "
             "give --defocus-um, DEFOC_UM or a column defocus_um"

@@ -278,9 +278,13 @@ def test_what_each_camera_moves(tmp_path, detector, moved):
 @pytest.mark.long
 def test_a_forgotten_defocus_is_said_to_be(tmp_path, monkeypatch, capsys, stamp):
     monkeypatch.chdir(tmp_path)
-    fits.PrimaryHDU(stamp, fits.Header({"FIELD_X": FIELD[0], "FIELD_Y": FIELD[1]})).writeto("d.fits")
+    header = fits.Header({"FIELD_X": FIELD[0], "FIELD_Y": FIELD[1], "FILTER": "r_57"})
+    fits.PrimaryHDU(stamp, header).writeto("d.fits")
     assert main(["donuts", "d.fits", *OPTIONS[2:]]) == 0
-    assert "defocus is 0 um, that of the files and --defocus-um together" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "defocus is 0 um, that of the files and --defocus-um together" in said
+    # The light that is taken, too: of other telescopes than the LSST the band is not that of the header.
+    assert "band r of its header; lsst_v3.3_r at 624 nm" in said
 
 
 @pytest.mark.long
