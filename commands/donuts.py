@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 from typer import Argument, Option
 
-from ..core.errors import ConfigError, PrescriptionWarning
+from ..core.errors import ConfigError, PachonError, PrescriptionWarning, ProductError
 from ..core.terminal import print_line, print_warning
 from . import completion
 from .choices import choice, names
@@ -299,6 +299,7 @@ def donuts_command(
     from ..sensing.model import DETECTOR, DonutAir, DonutDetector, DonutModel
     from ..sensing.observatory_zernikes import hexapod_corrections
     from ..sensing.orientation import check_orientation
+    from ..sensing.stamp_headers import TELESCOPE_KEY
     from ..sensing.wavefront_fits import SingleDonuts
     from ..wavefront.atmosphere.atmosphere import Atmosphere
     from ..wavefront.request import wavelength_points
@@ -335,9 +336,14 @@ def donuts_command(
     frames = options.frames(header)
     if "sky" in (frame, field_frame) and frames.parallactic_angle is None:
         raise ConfigError("frame sky without a parallactic angle: expected --parallactic-deg")
-    believed = frames.telescope(
-        load_model(telescope or header.model or DEFAULT_TELESCOPE, lenient, glass_catalogue or ())
-    )
+    try:
+        focused = load_model(telescope or header.model or DEFAULT_TELESCOPE, lenient, glass_catalogue or ())
+    except PachonError as error:
+        if telescope is not None or header.telescope is None:
+            raise
+        text = f"{TELESCOPE_KEY} = {header.telescope!r}: {error}; give the telescope by --telescope"
+        raise ProductError(text, file=files[0], key=TELESCOPE_KEY) from None
+    believed = frames.telescope(focused)
     noll = range(4, terms + 1)
     atmosphere = None if exposure_s is None else Atmosphere.from_site(site, 0, exposure=exposure_s)
     inputs = donut_inputs(files_read, options, frames, believed, _electrons(gain, header))

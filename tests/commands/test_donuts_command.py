@@ -1,6 +1,7 @@
 """``pachon donuts``: tables, pictures and JSON of FITS stamps, one line for bad input."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -129,6 +130,7 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
         (["plain.fits", "--pixel-um", "0", "--field-deg", "0,0"], "--pixel-um = 0: expected 1 to 10000 um"),
         (["plain.fits", "-o", "no_folder/a.ecsv", "--field-deg", "0,0"], "cannot write no_folder/a.ecsv"),
         (["plain.fits", "./plain.fits", "--field-deg", "0,0"], "plain.fits: given twice"),
+        (["simulated.fits"], "simulated.fits: TELMODEL = 'gone.yaml': gone.yaml: no such file; give the telescope by"),
         (["some.fits"], "some.fits: stamp 2 has no defocus, others have one"),
         (["lsst.fits"], "lsst.fits: unknown CCD of lsst 'R22_S99'"),
         (["plain.fits", "lsst.fits", "--field-deg", "0,0"], "lsst.fits: lsst, band r: expected that of plain.fits"),
@@ -142,6 +144,8 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, part):
     fits.HDUList([fits.PrimaryHDU(np.zeros((2, 16, 16))), table]).writeto("rows.fits")
     table = fits.BinTableHDU(Table({"field_x": [0.0] * 2, "field_y": [0.0] * 2, "defocus_um": [1500.0, np.nan]}))
     fits.HDUList([fits.PrimaryHDU(np.zeros((2, 16, 16))), table]).writeto("some.fits")
+    cards = {"TELMODEL": "gone.yaml", "WAVELEN": 600.0, "PIXEL_UM": 10.0, "FIELD_X": 0.0, "FIELD_Y": 0.0}
+    fits.PrimaryHDU(np.zeros((16, 16)), fits.Header(cards)).writeto("simulated.fits")
     if "rows.fits" in arguments and "--mask" in arguments:
         fits.PrimaryHDU(np.zeros((3, 16, 16))).writeto("rows.fits", overwrite=True)
     lsst = {"CAM_NAME": "LSSTCam", "DET_NAME": "R22_S99", "CENT_X": 5.0, "CENT_Y": 5.0, "BANDPASS": "r"}
@@ -165,6 +169,21 @@ def test_a_simulated_file_says_of_what_it_is(tmp_path):
     assert stamps.header.pixel == pytest.approx(10e-6)
     assert stamps.header.wavelength == pytest.approx(700e-9)
     assert 192 < fits.getdata(path).shape[1] < 260
+
+
+@pytest.mark.long
+def test_a_simulated_file_names_a_telescope_of_any_path(tmp_path):
+    """A path of more than a card's length once made a warning of FITS."""
+    folder = tmp_path / ("an_observers_folder_" * 3)
+    folder.mkdir()
+    telescope, path = str(folder / "rc.yaml"), tmp_path / "try.fits"
+    assert main(["new", "ritchey-chretien", telescope, "--diameter-mm", "1000", "--f-number", "8"]) == 0
+    simulate = ["donuts", str(path), "--simulate", "-t", telescope, "--defocus-um", "4000", "--set", "stars=1"]
+    for name in (telescope, str(Path(telescope).relative_to(tmp_path))):
+        with pytest.MonkeyPatch.context() as patched:
+            patched.chdir(tmp_path)
+            assert main([*simulate[:4], name, *simulate[5:], "--quiet"]) == 0
+        assert read_stamps(path).header.model == name
 
 
 @pytest.mark.slow
