@@ -308,6 +308,21 @@ def donuts_command(
     if pixel_um is not None:
         _require_within("--pixel-um", pixel_um, _PIXELS_UM)
     if simulate:
+        of_fits = {
+            "--positions": positions,
+            "--mask": mask,
+            "--variance": variance,
+            "--gain": gain,
+            "--exposure-s": exposure_s,
+            "--degrees-of-freedom": degrees_of_freedom,
+            "--stamp-axes": stamp_axes,
+            "--rotator-deg": rotator_deg,
+            "--parallactic-deg": parallactic_deg,
+            "--out": out,
+            "--picture": picture,
+        }
+        if ignored := [option for option, value in of_fits.items() if value is not None]:
+            raise ConfigError(f"{', '.join(ignored)}: expected without --simulate")
         name = telescope or DEFAULT_TELESCOPE
         focused = load_model(name, lenient, glass_catalogue or ())
         side = _pixel_um(pixel_um, None, focused.camera) * 1e-6

@@ -113,6 +113,7 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
         (["new.fits", "--simulate", "--perturb", "M2.dx=1arcsec"], "--perturb = 'M2.dx=1arcsec': expected a size in m"),
         (["new.fits", "--simulate", "--set", "star=2"], "--set: unknown key star = 2"),
         (["new.fits", "--simulate", "--set", "stars"], "--set 'stars': expected KEY=VALUE"),
+        (["new.fits", "--simulate", "--rotator-deg", "30", "-o", "a.ecsv"], "--rotator-deg, --out: expected without"),
         (["new.txt", "--simulate"], "new.txt: --simulate: expected one FILE.fits"),
         (["plain.fits", "--frame", "XYZ"], "--frame = 'XYZ': expected"),
         (["plain.fits", "--field-frame", "ocs"], "--field-frame = 'ocs': expected"),
