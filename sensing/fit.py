@@ -230,7 +230,7 @@ def fit_donuts(
                 # Not the telescope's: each donut keeps the rims of its own fit.
                 refined = replace(refined, free_rims=instrument.free_rims)
                 again = fitted if refined.terms is instrument.terms else once_more(refined)
-            # A refinement with which the fit of some donut does not converge would lose it.
+            # No donut is lost by a refinement.
             if not any(DonutFlag.NOT_CONVERGED in again.stars[i].flags for i in fitted.solutions):
                 instrument, fitted = refined, again
     result = _result(instrument, observed, fitted)
@@ -296,8 +296,6 @@ def _fit_alone(
     masked = star.masked | not_finite
     saturated = _saturated(np.where(masked, 0.0, star.image), masked, instrument.model.detector.saturation)
     masked = masked | grown(saturated, ~masked)
-    if star.masked.all():
-        return StarFit(DonutFlag.MOSTLY_LOST)
     donut = light.diameter > SMALLEST_DONUT * instrument.pixel
     wavefront = not joint or donut
     fitted_once = partial(
@@ -316,7 +314,7 @@ def _fit_alone(
         return StarFit(DonutFlag.SATURATED)
     if not_finite.any() and (DonutFlag.MOSTLY_LOST in fitted.flags or not_finite.mean() > _MOST):
         return StarFit(DonutFlag.NOT_FINITE)
-    return fitted
+    return StarFit(DonutFlag.MOSTLY_LOST) if star.masked.all() else fitted
 
 
 def _fit_with_steps(fit: Callable[..., StarFit], star: ObservedStar, begun: StarFit | None, searched: bool) -> StarFit:

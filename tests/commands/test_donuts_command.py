@@ -1,6 +1,7 @@
 """``pachon donuts``: tables, pictures and JSON of FITS stamps, one line for bad input."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from pachon.sensing.stamp_files import read_stamps
 # The pictures are drawn in tests/sensing/test_fit_donuts.py.
 pytestmark = pytest.mark.usefixtures("empty_pictures")
 
+ROOT = Path(__file__).parents[2]
 FIELD = (0.6, 0.9)
 OPTIONS = ["--defocus-um", "1500", "--pixel-um", "20", "--zernikes", "11", "--higher-order-nm", "0", "--no-diffraction"]
 
@@ -170,6 +172,16 @@ def test_a_simulated_file_says_of_what_it_is(tmp_path):
     assert stamps.header.pixel == pytest.approx(10e-6)
     assert stamps.header.wavelength == pytest.approx(700e-9)
     assert 192 < fits.getdata(path).shape[1] < 260
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
+def test_the_command_on_the_first_page_runs(tmp_path, monkeypatch, page):
+    """It lacked the defocus."""
+    (command,) = re.findall(r"`pachon (donuts [^`]* --simulate[^`]*)`", (ROOT / page).read_text(encoding="utf-8"))
+    monkeypatch.chdir(tmp_path)
+    assert main([*command.split(), "--set", "stars=1", "--quiet"]) == 0
+    assert len(read_stamps(tmp_path / "try.fits")) == 1
 
 
 @pytest.mark.long
