@@ -348,7 +348,7 @@ def _column(table: Table, name: str, file: Path, *, may_lack: bool = False) -> n
     if values.ndim != 1 or values.dtype.kind not in "iuf":
         text = f"column {name} of shape {values.shape} and type {values.dtype}: expected a number a row"
         raise ProductError(text, file=file, key=name)
-    numbers = np.asarray(values.astype(np.float64).filled(np.nan))
+    numbers = np.ma.filled(values.astype(np.float64), np.nan)
     lacking = np.flatnonzero(~np.isfinite(numbers))
     if lacking.size and not may_lack:
         text = f"{name} = {numbers[lacking[0]]} in row {lacking[0] + 1}: expected a finite number"
