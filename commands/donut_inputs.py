@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,8 +27,10 @@ FRAME_NAMES = ("OCS", "CCS", "DVCS", "ZCS", "sky")
 DEFAULT_TELESCOPE = "lsst_v3.3_r"
 #: Side of a pixel where neither option nor header says it [um].
 DEFAULT_PIXEL_UM = 10.0
-#: Body that each camera's telescope moves out of focus, of those that do not move their detector.
-_MOVED = {"lsst": "Camera", "comcam": "Camera", "auxtel": "M2"}
+#: Body that each camera's telescope moves out of focus.
+_MOVED = {"lsst": "Camera", "comcam": "Camera", "auxtel": "M2", "decam": "DECam"}
+#: Names of detectors that stand out of focus themselves: LSST's corner sensors and DECam's focus chips.
+_OUT_OF_FOCUS = re.compile(r"\w+_SW\d|F[NS]\d")
 #: Difference of angles of one exposure that is rounding of its headers [rad].
 _SAME_ANGLE = 1e-3
 
@@ -63,6 +66,8 @@ class FrameOptions:
 
         from ..sensing.frames import DonutFrames
 
+        if self.field_deg is not None:
+            degrees_pair(self.field_deg, "--field-deg")
         rotator = header.rotator or 0.0 if self.rotator_deg is None else np.deg2rad(self.rotator_deg)
         parallactic = header.parallactic_angle if self.parallactic_deg is None else np.deg2rad(self.parallactic_deg)
         for option, value in (("--rotator-deg", rotator), ("--parallactic-deg", parallactic)):
@@ -103,6 +108,9 @@ class StampFiles:
         for option, plane in (("--mask", mask), ("--variance", variance)):
             if plane is not None and len(paths) > 1:
                 raise ConfigError(f"{option} = {plane} for {len(paths)} files: expected one file of stamps with it")
+        for path in paths:
+            if sum(path.resolve() == other.resolve() for other in paths) > 1:
+                raise ConfigError("given twice: its donuts would count as two exposures", file=path)
         return cls(paths, [read_stamps(path, positions, size, mask=mask, variance=variance) for path in paths])
 
     def header(self) -> HeaderValues:
@@ -134,7 +142,7 @@ class StampFiles:
 
         named = one_body([stamps.moved or "" for stamps in self.stamps], self.paths[-1])
         detectors = [str(name) for stamps in self.stamps for name in stamps.detectors]
-        if named is not None or any("_SW" in name for name in detectors):
+        if named is not None or any(_OUT_OF_FOCUS.fullmatch(name) for name in detectors):
             return named
         return _MOVED.get(self.stamps[0].header.camera or "")
 
@@ -184,6 +192,10 @@ def donut_inputs(
         places = stamp_places(stamps, telescope, path, options.projection) if on_camera(stamps) else None
         fields.append(_fields(path, stamps, options, frames, None if places is None else places.fields))
         nominal = np.zeros(len(stamps)) if places is None else places.heights
+        lacking = np.flatnonzero(~stamps.has_defocus & (nominal == 0.0))
+        if stamps.has_defocus.any() and lacking.size:
+            text = f"stamp {lacking[0] + 1} has no defocus, others have one: expected it of all"
+            raise ProductError(text, file=path, key="defocus_um")
         # Of a sensor that stands out of focus files say how far: nothing was moved.
         heights.append(np.where((nominal != 0.0) & stamps.has_defocus, stamps.defocus, nominal))
         defocus.append(np.where(nominal != 0.0, 0.0, stamps.defocus))

@@ -79,7 +79,7 @@ def motion_rows(motions: BodyMotions) -> tuple[tuple[str, ...], list[tuple[str, 
         motions.body, motions.shift, motions.shift_error, motions.tilt, motions.tilt_error, strict=True
     ):
         shift, shift_error, tilt, tilt_error = values
-        cells = [f"{v:+.2f} +- {e:.2f}" for v, e in zip((*shift, *tilt), (*shift_error, *tilt_error), strict=True)]
+        cells = [_motion(v, e) for v, e in zip((*shift, *tilt), (*shift_error, *tilt_error), strict=True)]
         rows.append((str(body), *cells))
     headings = ("body", "dx [um]", "dy [um]", "dz [um]", "rx [arcsec]", "ry [arcsec]", "rz [arcsec]")
     return (
@@ -87,6 +87,11 @@ def motion_rows(motions: BodyMotions) -> tuple[tuple[str, ...], list[tuple[str, 
         rows,
         f"Hexapod corrections, which undo the motions fitted, along and about axes of {motions.frame}.",
     )
+
+
+def _motion(value: float, error: float) -> str:
+    """Return a motion with its error; a dash for one that is not among the degrees of freedom."""
+    return f"{value:+.2f} +- {error:.2f}" if error else "-"
 
 
 def show_fit(fit: DonutFit, converted: ObservatoryZernikes, motions: BodyMotions | None) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 from typer import Argument, Option
 
-from ..core.errors import ConfigError, PrescriptionWarning
+from ..core.errors import ConfigError, PachonError, PrescriptionWarning, ProductError
 from ..core.terminal import print_line, print_warning
 from . import completion
 from .choices import choice, names
@@ -50,6 +50,9 @@ _OUTPUT = "Output"
 _CHOICES = "Diffraction and orientation"
 #: Field angle from which on a donut tells its orientation, as a fraction of the telescope's field.
 _OFF_AXIS = 0.25
+#: Least and greatest side of a pixel, and greatest shift of a body [um].
+_PIXELS_UM = (1.0, 1e4)
+_MOST_DEFOCUS_UM = 1e5
 #: Donuts that are enough for a check of orientation wherever they stand.
 _SEVERAL = 3
 
@@ -268,11 +271,11 @@ def donuts_command(
     A file holds a cube of stamps and a table with their fields (field_x, field_y [deg], defocus_um), one stamp an
     extension with keywords FIELD_X, FIELD_Y and DEFOC_UM, or the image of a CCD, with --positions. Of LSSTCam, ComCam,
     LATISS and DECam, and of ts_wep's DonutStamps, headers give camera, detector, pixel, angles, band and gain, and
-    extensions MASK, VARIANCE (DQ, WEIGHT) are read. Stamps have x and y along those of the camera, unless --stamp-axes
-    or the header's detector says otherwise. A defocus moves what --moved, a keyword MOVED or a column moved names, or
-    the header's camera: Camera (full-array mode of LSSTCam), M2 (AuxTel), else the detector. Bad donuts are flagged
-    with the reason. Two donuts or more are taken to be of one exposure, or of both sides of focus: they are fitted
-    together (--each-alone: not).
+    extensions MASK, VARIANCE (DQ, WEIGHT, ERR) are read. Stamps have x and y along those of the camera, unless
+    --stamp-axes or the header's detector says otherwise. A defocus moves what --moved, a keyword MOVED or a column
+    moved names, or the header's camera: Camera (full-array mode of LSSTCam), M2 (AuxTel), DECam, else the detector.
+    Bad donuts are flagged with the reason. Two donuts or more are taken to be of one exposure, or of both sides of
+    focus: they are fitted together (--each-alone: not).
 
     **Examples**
 
@@ -283,7 +286,7 @@ def donuts_command(
     - `pachon donuts corner_*.fits -t rubin_v3.14_i --degrees-of-freedom lsst --json`
     - `pachon donuts ccd.fits --positions stars.ecsv --stamp 200 --defocus-um -1500`
     - `pachon donuts donutStamps.fits --frame CCS --convention ts_wep` (as LSST's zk_deviation_CCS)
-    - `pachon donuts DECam_*.stamp.fits --defocus-um 2000 --convention donut`
+    - `pachon donuts DECam_*.stamp.fits --defocus-um 1650 --convention donut`
     - `pachon donuts stamps.fits --stamp-axes DVCS --rotator-deg 12.3 --degrees-of-freedom lsst --frame ZCS`
     """
     import numpy as np
@@ -296,10 +299,30 @@ def donuts_command(
     from ..sensing.model import DETECTOR, DonutAir, DonutDetector, DonutModel
     from ..sensing.observatory_zernikes import hexapod_corrections
     from ..sensing.orientation import check_orientation
+    from ..sensing.stamp_headers import TELESCOPE_KEY
     from ..sensing.wavefront_fits import SingleDonuts
     from ..wavefront.atmosphere.atmosphere import Atmosphere
+    from ..wavefront.request import wavelength_points
 
+    _require_within("--defocus-um", defocus_um, (-_MOST_DEFOCUS_UM, _MOST_DEFOCUS_UM))
+    if pixel_um is not None:
+        _require_within("--pixel-um", pixel_um, _PIXELS_UM)
     if simulate:
+        of_fits = {
+            "--positions": positions,
+            "--mask": mask,
+            "--variance": variance,
+            "--gain": gain,
+            "--exposure-s": exposure_s,
+            "--degrees-of-freedom": degrees_of_freedom,
+            "--stamp-axes": stamp_axes,
+            "--rotator-deg": rotator_deg,
+            "--parallactic-deg": parallactic_deg,
+            "--out": out,
+            "--picture": picture,
+        }
+        if ignored := [option for option, value in of_fits.items() if value is not None]:
+            raise ConfigError(f"{', '.join(ignored)}: expected without --simulate")
         name = telescope or DEFAULT_TELESCOPE
         focused = load_model(name, lenient, glass_catalogue or ())
         side = _pixel_um(pixel_um, None, focused.camera) * 1e-6
@@ -328,9 +351,14 @@ def donuts_command(
     frames = options.frames(header)
     if "sky" in (frame, field_frame) and frames.parallactic_angle is None:
         raise ConfigError("frame sky without a parallactic angle: expected --parallactic-deg")
-    believed = frames.telescope(
-        load_model(telescope or header.model or DEFAULT_TELESCOPE, lenient, glass_catalogue or ())
-    )
+    try:
+        focused = load_model(telescope or header.model or DEFAULT_TELESCOPE, lenient, glass_catalogue or ())
+    except PachonError as error:
+        if telescope is not None or header.telescope is None:
+            raise
+        text = f"{TELESCOPE_KEY} = {header.telescope!r}: {error}; give the telescope by --telescope"
+        raise ProductError(text, file=files[0], key=TELESCOPE_KEY) from None
+    believed = frames.telescope(focused)
     noll = range(4, terms + 1)
     atmosphere = None if exposure_s is None else Atmosphere.from_site(site, 0, exposure=exposure_s)
     inputs = donut_inputs(files_read, options, frames, believed, _electrons(gain, header))
@@ -358,7 +386,8 @@ def donuts_command(
     if sky_variance is not None:
         sky = [sky_variance] * len(inputs.images)
     if not quiet and header.text:
-        print_line(f"{files[0]}: {header.text} of its header; {believed.name}", error=True)
+        lengths = ", ".join(f"{1e9 * wavelength:.4g}" for wavelength in wavelength_points(believed, light))
+        print_line(f"{files[0]}: {header.text} of its header; {believed.name} at {lengths} nm", error=True)
     orientation = None
     with (
         warnings_shown(PrescriptionWarning),
@@ -382,7 +411,9 @@ def donuts_command(
         checked = fit.usable | (fit.flags & int(DonutFlag.DEFOCUS_SIGN) > 0)
         which = [int(i) for i in checked.nonzero()[0]]
         off_axis = (abs(inputs.fields[which]) > _OFF_AXIS * believed.field_radius).any()
-        if orientation_check and which and (len(which) >= _SEVERAL or off_axis):
+        as_expected = fit.usable & (fit.flags & int(DonutFlag.OTHER_SIZE) == 0)
+        defocused = bool(as_expected.any() or model.detector.shifts(len(fit)).any())
+        if orientation_check and defocused and which and (len(which) >= _SEVERAL or off_axis):
             shifts = model.detector.shifts(len(inputs.images))[which]
             orientation = check_orientation(
                 believed,
@@ -398,6 +429,11 @@ def donuts_command(
     if orientation is not None and orientation.doubtful:
         fit = replace(fit, flags=fit.flags | checked * int(DonutFlag.ORIENTATION))
         print_warning(orientation_text(orientation, inputs))
+    if not defocused:
+        print_warning(
+            "defocus is 0 um, that of the files and --defocus-um together: stars are fitted as in focus. Of donuts, "
+            "give --defocus-um, DEFOC_UM or a column defocus_um"
+        )
     converted = fit.zernikes_in(cast("ZernikeConvention", convention), output_frame, frames=frames)
     motions = None
     if fit.degrees_of_freedom is not None:
@@ -420,6 +456,12 @@ def _electrons(gain: float | None, header: HeaderValues) -> float:
     return gain
 
 
+def _require_within(option: str, value: float, bounds: tuple[float, float]) -> None:
+    """Raise a ConfigError for a length of an option [um] beyond its bounds."""
+    if not bounds[0] <= value <= bounds[1]:
+        raise ConfigError(f"{option} = {value:g}: expected {bounds[0]:g} to {bounds[1]:g} um")
+
+
 def _pixel_um(pixel_um: float | None, stated: float | None, camera: str | None) -> float:
     """Return the side of a pixel [um]: of the option, that stated [m], of the camera, or that of the LSST."""
     from ..models.camera.cameras import load_camera
@@ -433,11 +475,14 @@ def _pixel_um(pixel_um: float | None, stated: float | None, camera: str | None) 
 
 def _output_kind(table: Path | None, picture: Path | None) -> str:
     """Return the format of the picture; a ConfigError for names of files of other formats."""
+    from ..core.files import require_writable
     from ..core.table_files import FORMATS
 
     kind = picture_kind(picture)
     if table is not None and table.suffix.lower() not in FORMATS:
         raise ConfigError(f"--out = {table}: expected a name that ends in {', '.join(FORMATS)}")
+    if table is not None:
+        require_writable(table, file=True)
     return kind
 
 

@@ -230,7 +230,9 @@ def fit_donuts(
                 # Not the telescope's: each donut keeps the rims of its own fit.
                 refined = replace(refined, free_rims=instrument.free_rims)
                 again = fitted if refined.terms is instrument.terms else once_more(refined)
-            instrument, fitted = refined, again
+            # No donut is lost by a refinement.
+            if not any(DonutFlag.NOT_CONVERGED in again.stars[i].flags for i in fitted.solutions):
+                instrument, fitted = refined, again
     result = _result(instrument, observed, fitted)
     warn_of_other_hole(instrument, fitted.solutions, result)
     return result
@@ -312,7 +314,7 @@ def _fit_alone(
         return StarFit(DonutFlag.SATURATED)
     if not_finite.any() and (DonutFlag.MOSTLY_LOST in fitted.flags or not_finite.mean() > _MOST):
         return StarFit(DonutFlag.NOT_FINITE)
-    return fitted
+    return StarFit(DonutFlag.MOSTLY_LOST) if star.masked.all() else fitted
 
 
 def _fit_with_steps(fit: Callable[..., StarFit], star: ObservedStar, begun: StarFit | None, searched: bool) -> StarFit:

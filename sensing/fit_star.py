@@ -140,7 +140,9 @@ def fit_star(
     pixels = pixels.central(fitter.clean.image.shape)
     flags = DonutFlag.OK
     if not start.match.significance >= _FOUND:
-        flags |= DonutFlag.NO_DONUT
+        # On a stamp that is much smaller than its donut nothing stands out.
+        small = pixels.image.size < (1.0 - _LOST) * _area(instrument, light)
+        flags |= DonutFlag.MOSTLY_LOST if donut and small else DonutFlag.NO_DONUT
     if start.match.flux < len(NUISANCES) + (len(instrument.noll) if wavefront else 0):
         flags |= DonutFlag.TOO_FEW_PHOTONS
     if flags:
@@ -165,6 +167,11 @@ def fit_star(
     if fitter.lost_light(start.stamp, best).any_pixel > _LOST:
         return StarFit(DonutFlag.MOSTLY_LOST)
     return _finished(fitter, pixels, best, sides, sky_level, search.rivals, preliminary)
+
+
+def _area(instrument: Instrument, light: StarLight) -> float:
+    """Return the area of the ring of a donut [pixels]."""
+    return 0.25 * np.pi * (light.diameter / instrument.pixel) ** 2 * (1.0 - instrument.telescope.pupil_obscuration**2)
 
 
 def _holds(begun: StarFit, light: StarLight) -> bool:

@@ -143,12 +143,19 @@ class ObservatoryZernikes(Result):
         return table
 
     def in_table(self, table: QTable) -> QTable:
-        """Return a table of the same donuts with its fields and Zernikes in this frame and convention."""
+        """Return a table of the same donuts with its fields and Zernikes in this frame and convention.
+
+        Zernikes of the convention ``pachon`` are in the unit that the table has for them.
+        """
         converted = self.to_table()
         merged = table.copy()
         for name in converted.colnames:
-            merged[name] = converted[name]
+            unit = table[name].unit if self.convention == "pachon" and name.startswith("Z") else converted[name].unit
+            merged[name] = converted[name].to(unit)
+            merged[name].info.description = converted[name].info.description
         merged.meta.update(converted.meta)
+        if self.convention == "pachon":
+            merged.meta["zernike_unit"] = str(table[f"Z{self.noll[0]}"].unit)
         return merged
 
     def description(self) -> dict[str, Any]:

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 _SHOWN = 6
 #: Range of the residuals over their standard deviation.
 _RANGE = 5.0
-# Light of the model, as a part of the brightest, below which residuals tell the noise of the sky.
-_DARK = 0.05
 #: Meaning of the columns of the table.
 _WAVEFRONT = "wavefront beyond that of the telescope, annular Zernike term of this Noll index"
 _MEANINGS = {
@@ -336,6 +334,16 @@ class DonutFit(Result):
         return _draw(self, donuts, ax)
 
 
+def _levels(image: np.ndarray, background: float) -> tuple[float, float]:
+    """Return background and brightest light of a stamp; of one without a result both from its pixels."""
+    finite = image[np.isfinite(image)]
+    if not finite.size:
+        return 0.0, 1.0
+    base = float(background if np.isfinite(background) else np.percentile(finite, 10.0))
+    top = float(np.percentile(finite, 99.5))
+    return base, top if top > base else base + 1.0
+
+
 def _draw(fit: DonutFit, donuts: slice | list[int] | None, ax: Axes | Figure | None) -> Figure:
     """Draw a fit; see :meth:`DonutFit.plot`."""
     shown_donuts = np.arange(len(fit))[slice(_SHOWN) if donuts is None else donuts]
@@ -347,13 +355,13 @@ def _draw(fit: DonutFit, donuts: slice | list[int] | None, ax: Axes | Figure | N
         panels = upper.subplots(3, n, squeeze=False, sharex=True, sharey=True)
         for column, i in enumerate(shown_donuts):
             image, model = fit.images[i], fit.model[i]
-            top = float(np.nanpercentile(image, 99.5)) if np.isfinite(image).any() else 0.0
-            top = top if top > 0.0 else 1.0
-            dark = fit.residuals[i][(model < _DARK * top) & fit.used[i]] if fit.usable[i] else np.zeros(1)
-            noise = np.sqrt(np.maximum(np.abs(model), 1.0) + (dark.var() if dark.size else 0.0))
-            pull = np.where(fit.used[i], fit.residuals[i] / noise, np.nan)
-            shown = panels[0, column].imshow(image, cmap="viridis", vmin=0.0, vmax=top)
-            panels[1, column].imshow(model, cmap="viridis", vmin=0.0, vmax=top)
+            # Each star has a scale of its own, from its background on.
+            base, top = _levels(image, fit.background[i])
+            photon = fit.photon_variance[i]
+            variance = np.maximum(fit.sky_variance[i] + photon * np.maximum(model - base, 0.0), photon)
+            pull = np.where(fit.used[i], fit.residuals[i] / np.sqrt(variance), np.nan)
+            shown = panels[0, column].imshow((image - base) / (top - base), cmap="viridis", vmin=0.0, vmax=1.0)
+            panels[1, column].imshow((model - base) / (top - base), cmap="viridis", vmin=0.0, vmax=1.0)
             spread = panels[2, column].imshow(pull, cmap="RdBu_r", vmin=-_RANGE, vmax=_RANGE)
             x, y = np.rad2deg(fit.fields[i])
             flag = DonutFlag(int(fit.flags[i])).reasons
@@ -361,10 +369,10 @@ def _draw(fit: DonutFit, donuts: slice | list[int] | None, ax: Axes | Figure | N
             if fit.usable[i]:
                 seeing = float(arcseconds(fit.fwhm[i]))
                 quality = fit.chi2[i] / fit.n_pixels[i]
-                panels[2, column].set_xlabel(f'FWHM {seeing:.2f}"\nchi2/pixel {quality:.2f}', fontsize=8)
+                panels[2, column].set_xlabel(f'x [pixel]\nFWHM {seeing:.2f}"\nchi2/pixel {quality:.2f}', fontsize=8)
         for row, name in enumerate(("image", "model", "residual / noise")):
-            panels[row, 0].set_ylabel(name)
-        upper.colorbar(shown, ax=panels[:2], fraction=0.02, pad=0.01, label="electrons")
+            panels[row, 0].set_ylabel(f"{name}\ny [pixel]")
+        upper.colorbar(shown, ax=panels[:2], fraction=0.02, pad=0.01, label="light over each star's brightest")
         upper.colorbar(spread, ax=panels[2], fraction=0.02, pad=0.01)
         bars = lower.subplots()
         width = 0.85 / n
@@ -380,7 +388,7 @@ def _draw(fit: DonutFit, donuts: slice | list[int] | None, ax: Axes | Figure | N
                 label=f"({x:.3g}, {y:.3g})°",
             )
         name_terms(bars, fit.noll)
-        bars.set_ylabel("coefficient = rms over the annulus [nm]")
+        bars.set_ylabel("rms over the annulus [nm], OCS")
         bars.legend(loc="best", ncols=3, fontsize=7)
         waves = ", ".join(f"{w * 1e9:.4g}" for w in fit.wavelengths)
         figure.suptitle(

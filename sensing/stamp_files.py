@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from astropy import units as u
 from astropy.io import fits
 from astropy.table import Table
 
@@ -31,11 +32,14 @@ _PLANES = {
     "mask": r"MASK|MSK|DQ|QUALITY|FLAGS|BPM",
     "variance": r"VARIANCE|VAR",
     "weight": r"WEIGHT|WGT|WHT|WTMAP|IVAR|INVVAR",
+    "deviation": r"ERR|ERROR|SIGMA|STDDEV|UNCERT",
 }
+#: Kinds of extensions UNCERT of astropy's CCDData by their keyword UTYPE; standard deviations without one.
+_UNCERTAINTIES = {"VarianceUncertainty": "variance", "InverseVariance": "weight"}
 #: Planes of LSST's masks whose pixels have no measured light; its headers number them by MP_<name>.
 _BAD_PLANES = ("BAD", "SAT", "INTRP", "CR", "EDGE", "NO_DATA", "SUSPECT", "UNMASKEDNAN")
-#: Columns that make a table one of stamps or positions.
-_COLUMNS = {"field_x", "field_y", "x", "y", "defocus_um"}
+#: Units of the columns that make a table one of stamps or positions; those of columns with other units are converted.
+_COLUMNS = {"field_x": u.deg, "field_y": u.deg, "x": u.pixel, "y": u.pixel, "defocus_um": u.um}
 
 
 @dataclass(frozen=True)
@@ -133,10 +137,16 @@ def _stamps_of(
     """Return the stamps of the units of a file, with files of masks and variances; see :func:`read_stamps`."""
     primary = units[0][0] if units else fits.Header()
     images = _with_planes(units, path, primary, *planes)
-    tables = [data for _, data in units if isinstance(data, Table) and _names(data) & _COLUMNS]
+    tables = [data for _, data in units if isinstance(data, Table) and _names(data) & set(_COLUMNS)]
     table = _table(positions) if positions is not None else tables[0] if tables else None
-    if not images or any(i.data.ndim not in (2, 3) or min(i.data.shape[-2:]) < SMALLEST_STAMP for i in images):
-        raise ProductError("expected images: a cube [n, ny, nx], stamps, or one image of a CCD", file=path)
+    if table is not None:
+        _require_pairs(table, positions or path)
+    expected = f"a cube [n, ny, nx], stamps, or one image of a CCD, of at least {SMALLEST_STAMP} pixels a side"
+    if not images:
+        raise ProductError(f"no images: expected {expected}", file=path)
+    for image in images:
+        if image.data.ndim not in (2, 3) or min(image.data.shape[-2:]) < SMALLEST_STAMP:
+            raise ProductError(f"image of shape {list(image.data.shape)}: expected images: {expected}", file=path)
     values = header_values([image.header for image in images], path)
     named = [str(image.header["MOVED"]).strip() for image in images if "MOVED" in image.header]
     moved = one_body([*named, *(_texts(table, "moved") if table is not None else ())], path)
@@ -176,7 +186,7 @@ def _cut_stamps(
     image: _Image, table: Table, size: int, positions: Path, values: HeaderValues, path: Path
 ) -> DonutStamps:
     """Return stamps cut out of the image of a CCD about the places of a table."""
-    centers = np.stack([_column(table, "x"), _column(table, "y")], axis=-1)
+    centers = np.stack([_column(table, name, positions) for name in ("x", "y")], axis=-1)
     fields, shifts = _places(table, len(centers), positions)
     if shifts is None:
         shifts = np.full(len(centers), defocus_of(image.header, path))
@@ -244,6 +254,8 @@ def _with_planes(
         elif planes["weight"]:
             weight = np.asarray(planes["weight"][k][1], dtype=np.float64)
             own_variance = np.where(weight > 0.0, 1.0 / np.where(weight > 0.0, weight, 1.0), np.nan)
+        elif planes["deviation"]:
+            own_variance = np.asarray(planes["deviation"][k][1], dtype=np.float64) ** 2
         if own_variance is not None:
             own_mask = own_mask | ~(np.isfinite(own_variance) & (own_variance > 0.0))
         merged = stamp_header(primary, header, k) if header is not primary else header
@@ -252,9 +264,10 @@ def _with_planes(
 
 
 def _kind_of(header: fits.Header) -> str:
-    """Return what the pixels of an image are: image, mask, variance or weight."""
+    """Return what the pixels of an image are: image, mask, variance, weight or deviation."""
     name = str(header.get("EXTNAME", "")).strip().upper()
-    return next((k for k, names in _PLANES.items() if re.fullmatch(rf"({names})[_ ]?\d*", name)), "image")
+    kind = next((k for k, names in _PLANES.items() if re.fullmatch(rf"({names})[_ ]?\d*", name)), "image")
+    return _UNCERTAINTIES.get(str(header.get("UTYPE", "")).strip(), kind) if kind == "deviation" else kind
 
 
 def _bad_pixels(header: fits.Header, values: np.ndarray) -> np.ndarray:
@@ -314,12 +327,39 @@ def _names(table: Table) -> set[str]:
     return {name.lower() for name in table.colnames}
 
 
-def _column(table: Table, name: str) -> np.ndarray:
-    """Return a column of numbers by its name in any case; ProductError where it holds something else."""
-    values = np.asarray(table[next(n for n in table.colnames if n.lower() == name)])
+def _require_pairs(table: Table, file: Path) -> None:
+    """Raise a ProductError for a table without rows, without a known column, or with one of two that go together."""
+    names = _names(table)
+    pairs = [{"x", "y"}, {"field_x", "field_y"}]
+    if not names & set(_COLUMNS) or any(len(names & pair) == 1 for pair in pairs):
+        columns = ", ".join(table.colnames[:8]) or "none"
+        raise ProductError(f"columns {columns}: expected x and y [pixels], field_x and field_y [deg]", file=file)
+    if not len(table):
+        raise ProductError("table of 0 rows: expected one row a stamp", file=file)
+
+
+def _column(table: Table, name: str, file: Path, *, may_lack: bool = False) -> np.ndarray:
+    """Return a column of numbers by its name in any case, in the unit that it should have; ProductError otherwise.
+
+    A number that is missing, or not finite, is an error too unless columns may lack some, which are NaN then.
+    """
+    column = table[next(n for n in table.colnames if n.lower() == name)]
+    values = np.ma.asarray(column)
     if values.ndim != 1 or values.dtype.kind not in "iuf":
-        raise ProductError(f"column {name} of shape {values.shape} and type {values.dtype}: expected a number a row")
-    return values.astype(np.float64)
+        text = f"column {name} of shape {values.shape} and type {values.dtype}: expected a number a row"
+        raise ProductError(text, file=file, key=name)
+    numbers = np.ma.filled(values.astype(np.float64), np.nan)
+    lacking = np.flatnonzero(~np.isfinite(numbers))
+    if lacking.size and not may_lack:
+        text = f"{name} = {numbers[lacking[0]]} in row {lacking[0] + 1}: expected a finite number"
+        raise ProductError(text, file=file, key=name)
+    unit = getattr(column, "unit", None) or u.dimensionless_unscaled
+    if unit == u.dimensionless_unscaled:
+        return numbers
+    try:
+        return numbers * float(unit.to(_COLUMNS[name]))
+    except (u.UnitsError, ValueError, TypeError):
+        raise ProductError(f"column {name} in {unit}: expected {_COLUMNS[name]}", file=file, key=name) from None
 
 
 def _texts(table: Table, name: str) -> list[str]:
@@ -335,8 +375,9 @@ def _places(table: Table, count: int, file: Path) -> tuple[np.ndarray | None, np
         raise ProductError(f"table of {len(table)} rows for {count} stamps: expected one row a stamp", file=file)
     fields = None
     if {"field_x", "field_y"} <= names:
-        fields = np.deg2rad(np.stack([_column(table, "field_x"), _column(table, "field_y")], axis=-1))
-    defocus = 1e-6 * _column(table, "defocus_um") if "defocus_um" in names else None
+        fields = np.deg2rad(np.stack([_column(table, name, file) for name in ("field_x", "field_y")], axis=-1))
+    # Of sensors that stand out of focus a table need not say how far.
+    defocus = 1e-6 * _column(table, "defocus_um", file, may_lack=True) if "defocus_um" in names else None
     return fields, defocus
 
 

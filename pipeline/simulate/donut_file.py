@@ -213,7 +213,9 @@ def write_donuts(path: Path, donuts: SimulatedDonuts, scene: DonutScene, model: 
         "SEED": (scene.seed, "seed of all random numbers"),
     }
     for key, (value, comment) in cards.items():
-        cube.header[key] = (value, comment)
+        # A card has 80 characters: a path may leave none for a comment.
+        room = 80 - len("KEYWORD = ' ' / ") - len(str(value))
+        cube.header[key] = (value, comment) if len(comment) <= room else value
     unit = fits.BinTableHDU(table, name="DONUTS")
     write_hdus(path, fits.HDUList([cube, unit]))
 

@@ -1,6 +1,8 @@
 """``pachon donuts``: tables, pictures and JSON of FITS stamps, one line for bad input."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,11 +12,15 @@ from scipy.ndimage import gaussian_filter
 
 import pachon
 from pachon.commands.cli import main
+from pachon.commands.donut_inputs import StampFiles
+from pachon.commands.donut_report import motion_rows
+from pachon.sensing.observatory_zernikes import BodyMotions
 from pachon.sensing.stamp_files import read_stamps
 
 # The pictures are drawn in tests/sensing/test_fit_donuts.py.
 pytestmark = pytest.mark.usefixtures("empty_pictures")
 
+ROOT = Path(__file__).parents[2]
 FIELD = (0.6, 0.9)
 OPTIONS = ["--defocus-um", "1500", "--pixel-um", "20", "--zernikes", "11", "--higher-order-nm", "0", "--no-diffraction"]
 
@@ -109,6 +115,7 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
         (["new.fits", "--simulate", "--perturb", "M2.dx=1arcsec"], "--perturb = 'M2.dx=1arcsec': expected a size in m"),
         (["new.fits", "--simulate", "--set", "star=2"], "--set: unknown key star = 2"),
         (["new.fits", "--simulate", "--set", "stars"], "--set 'stars': expected KEY=VALUE"),
+        (["new.fits", "--simulate", "--rotator-deg", "30", "-o", "a.ecsv"], "--rotator-deg, --out: expected without"),
         (["new.txt", "--simulate"], "new.txt: --simulate: expected one FILE.fits"),
         (["plain.fits", "--frame", "XYZ"], "--frame = 'XYZ': expected"),
         (["plain.fits", "--field-frame", "ocs"], "--field-frame = 'ocs': expected"),
@@ -119,6 +126,15 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
         (["plain.fits", "--gain", "0", "--field-deg", "0,0"], "--gain = 0.0: expected electrons of a unit, above 0"),
         (["plain.fits", "--mask", "rows.fits", "--field-deg", "0,0"], "1 of shape [3, 16, 16] for 1 images of [2, 16"),
         (["plain.fits", "plain.fits", "--mask", "plain.fits"], "for 2 files: expected one file of stamps with it"),
+        (
+            ["plain.fits", "--defocus-um", "nan", "--field-deg", "0,0"],
+            "--defocus-um = nan: expected -100000 to 100000 um",
+        ),
+        (["plain.fits", "--pixel-um", "0", "--field-deg", "0,0"], "--pixel-um = 0: expected 1 to 10000 um"),
+        (["plain.fits", "-o", "no_folder/a.ecsv", "--field-deg", "0,0"], "cannot write no_folder/a.ecsv"),
+        (["plain.fits", "./plain.fits", "--field-deg", "0,0"], "plain.fits: given twice"),
+        (["simulated.fits"], "simulated.fits: TELMODEL = 'gone.yaml': gone.yaml: no such file; give the telescope by"),
+        (["some.fits"], "some.fits: stamp 2 has no defocus, others have one"),
         (["lsst.fits"], "lsst.fits: unknown CCD of lsst 'R22_S99'"),
         (["plain.fits", "lsst.fits", "--field-deg", "0,0"], "lsst.fits: lsst, band r: expected that of plain.fits"),
     ],
@@ -129,6 +145,10 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, part):
     fits.PrimaryHDU(np.zeros((2, 16, 16))).writeto("plain.fits")
     table = fits.BinTableHDU(Table({"field_x": [0.0], "field_y": [0.0]}))
     fits.HDUList([fits.PrimaryHDU(np.zeros((2, 16, 16))), table]).writeto("rows.fits")
+    table = fits.BinTableHDU(Table({"field_x": [0.0] * 2, "field_y": [0.0] * 2, "defocus_um": [1500.0, np.nan]}))
+    fits.HDUList([fits.PrimaryHDU(np.zeros((2, 16, 16))), table]).writeto("some.fits")
+    cards = {"TELMODEL": "gone.yaml", "WAVELEN": 600.0, "PIXEL_UM": 10.0, "FIELD_X": 0.0, "FIELD_Y": 0.0}
+    fits.PrimaryHDU(np.zeros((16, 16)), fits.Header(cards)).writeto("simulated.fits")
     if "rows.fits" in arguments and "--mask" in arguments:
         fits.PrimaryHDU(np.zeros((3, 16, 16))).writeto("rows.fits", overwrite=True)
     lsst = {"CAM_NAME": "LSSTCam", "DET_NAME": "R22_S99", "CENT_X": 5.0, "CENT_Y": 5.0, "BANDPASS": "r"}
@@ -152,6 +172,31 @@ def test_a_simulated_file_says_of_what_it_is(tmp_path):
     assert stamps.header.pixel == pytest.approx(10e-6)
     assert stamps.header.wavelength == pytest.approx(700e-9)
     assert 192 < fits.getdata(path).shape[1] < 260
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
+def test_the_command_on_the_first_page_runs(tmp_path, monkeypatch, page):
+    """It lacked the defocus."""
+    (command,) = re.findall(r"`pachon (donuts [^`]* --simulate[^`]*)`", (ROOT / page).read_text(encoding="utf-8"))
+    monkeypatch.chdir(tmp_path)
+    assert main([*command.split(), "--set", "stars=1", "--quiet"]) == 0
+    assert len(read_stamps(tmp_path / "try.fits")) == 1
+
+
+@pytest.mark.long
+def test_a_simulated_file_names_a_telescope_of_any_path(tmp_path):
+    """A path of more than a card's length once made a warning of FITS."""
+    folder = tmp_path / ("an_observers_folder_" * 3)
+    folder.mkdir()
+    telescope, path = str(folder / "rc.yaml"), tmp_path / "try.fits"
+    assert main(["new", "ritchey-chretien", telescope, "--diameter-mm", "1000", "--f-number", "8"]) == 0
+    simulate = ["donuts", str(path), "--simulate", "-t", telescope, "--defocus-um", "4000", "--set", "stars=1"]
+    for name in (telescope, str(Path(telescope).relative_to(tmp_path))):
+        with pytest.MonkeyPatch.context() as patched:
+            patched.chdir(tmp_path)
+            assert main([*simulate[:4], name, *simulate[5:], "--quiet"]) == 0
+        assert read_stamps(path).header.model == name
 
 
 @pytest.mark.slow
@@ -249,3 +294,50 @@ def test_stamps_turned_by_half_are_not_taken_for_the_other_side_alone(tmp_path, 
     captured = capsys.readouterr()
     assert "defocus sign, orientation" in captured.out
     assert "try --stamp-axes=-x,-y" in captured.err
+
+
+@pytest.mark.parametrize(
+    ("detector", "moved"), [("S4", "DECam"), ("N31", "DECam"), ("FS1", None), ("R22_S11", "Camera"), ("R00_SW0", None)]
+)
+def test_what_each_camera_moves(tmp_path, detector, moved):
+    """DECam's hexapod moves the camera; sensors that stand out of focus are moved detectors."""
+    camera = "LSSTCam" if detector.startswith("R") else "DECam"
+    header = fits.Header({"INSTRUME": camera, "DETPOS": detector, "FIELD_X": 0.0, "FIELD_Y": 0.0})
+    fits.PrimaryHDU(np.zeros((16, 16)), header).writeto(tmp_path / "a.fits")
+    assert StampFiles.read([tmp_path / "a.fits"], None, 180, None, None).moved() == moved
+
+
+@pytest.mark.long
+def test_a_forgotten_defocus_is_said_to_be(tmp_path, monkeypatch, capsys, stamp):
+    monkeypatch.chdir(tmp_path)
+    header = fits.Header({"FIELD_X": FIELD[0], "FIELD_Y": FIELD[1], "FILTER": "r_57"})
+    fits.PrimaryHDU(stamp, header).writeto("d.fits")
+    assert main(["donuts", "d.fits", *OPTIONS[2:]]) == 0
+    said = capsys.readouterr().err
+    assert "defocus is 0 um, that of the files and --defocus-um together" in said
+    # The light that is taken, too: of other telescopes than the LSST the band is not that of the header.
+    assert "band r of its header; lsst_v3.3_r at 624 nm" in said
+
+
+@pytest.mark.long
+def test_tables_have_one_unit_in_every_frame(tmp_path, monkeypatch, stamp):
+    """In frames other than OCS Zernikes were written in m."""
+    monkeypatch.chdir(tmp_path)
+    header = fits.Header({"FIELD_X": FIELD[0], "FIELD_Y": FIELD[1]})
+    fits.PrimaryHDU(stamp, header).writeto("d.fits")
+    for frame in ("OCS", "CCS"):
+        arguments = ["donuts", "d.fits", *OPTIONS, "--quiet", "--frame", frame, "--no-orientation-check"]
+        assert main([*arguments, "-o", f"{frame}.ecsv"]) == 0
+    telescope, camera = (Table.read(f"{frame}.ecsv") for frame in ("OCS", "CCS"))
+    assert camera["Z5"].unit == camera["Z5_err"].unit == telescope["Z5"].unit == "nm"
+    assert camera.meta["zernike_unit"] == "nm"
+    for name in ("Z4", "Z5", "Z8", "Z8_err"):
+        assert camera[name][0] == pytest.approx(telescope[name][0], rel=1e-9)
+
+
+def test_motions_that_were_not_fitted_are_dashes():
+    shift, error = np.array([[1.0, 0.0, 0.0]]), np.array([[0.5, 0.0, 0.0]])
+    motions = BodyMotions(
+        frame="OCS", body=np.array(["M2"]), shift=shift, shift_error=error, tilt=0.0 * shift, tilt_error=0.0 * error
+    )
+    assert motion_rows(motions)[1] == [("M2", "+1.00 +- 0.50", "-", "-", "-", "-", "-")]

@@ -85,6 +85,29 @@ def test_a_wrong_side_is_said_by_all_donuts_together(focused, pairs):
     assert np.isnan(together.zernikes).all()
 
 
+class Refined(pachon.sensing.ExposureDonuts):
+    """Fit that is always refined."""
+
+    def refined(self, instrument, stars, fitted):
+        return instrument
+
+
+@pytest.mark.long
+def test_a_refinement_that_does_not_converge_loses_no_donut(focused, pairs, monkeypatch):
+    """Two of five donuts of DECam were lost with the higher terms of the air."""
+
+    def fit_star(*given, begun=None, **options):
+        fitted = one_star(*given, begun=begun, **options)
+        return fitted if begun is None else replace(fitted, flags=fitted.flags | pachon.sensing.DonutFlag.NOT_CONVERGED)
+
+    one_star = pachon.sensing.fit.fit_star
+    monkeypatch.setattr(pachon.sensing.fit, "fit_star", fit_star)
+    model = replace(of_sides(1, 1), diffraction=False)
+    fit = pachon.fit_donuts(focused, pairs[:2], FIELDS, WAVELENGTH, model=model, fit=Refined(), **OPTIONS)
+    assert fit.usable.all()
+    assert np.isfinite(fit.zernikes).all()
+
+
 def test_stars_have_a_number_each(focused):
     with pytest.raises(DomainError, match="stars of length 3: expected a number for each of 2 images"):
         pachon.fit_donuts(

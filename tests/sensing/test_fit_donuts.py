@@ -504,6 +504,16 @@ def test_results_do_not_depend_on_threads_or_on_other_donuts(behind_focus, clean
 
 
 @pytest.mark.long
+def test_stamps_without_the_light_of_their_donuts_are_lost(behind_focus, clean):
+    """All pixels masked, and a stamp that lies within its donut: these were said to be no donuts."""
+    middle = slice(len(clean) // 2 - 10, len(clean) // 2 + 10)
+    images = [noisy(clean, 500.0, 3), noisy(clean, 500.0, 4)[middle, middle]]
+    masks = [np.ones_like(image, dtype=bool) * (k == 0) for k, image in enumerate(images)]
+    fit = pachon.fit_donuts(behind_focus, images, [FIELD] * 2, WAVELENGTH, mask=masks, **OPTIONS)
+    assert fit.reasons == ["mostly lost", "mostly lost"]
+
+
+@pytest.mark.long
 def test_tables_summaries_and_pictures(behind_focus, clean):
     images = np.stack([clean, np.full_like(clean, np.nan)])
     fit = pachon.fit_donuts(
@@ -517,6 +527,19 @@ def test_tables_summaries_and_pictures(behind_focus, clean):
     assert text["zernike_nm"][1] == [None] * 8
     np.testing.assert_allclose(fit.residuals[0], fit.images[0] - fit.model[0])
     assert len(fit.plot().axes) >= 7
+
+
+@pytest.mark.long
+def test_pictures_of_counts_have_the_noise_of_the_fit(behind_focus, clean):
+    """Each star has its own scale from its background on, whatever the unit; the level of a bias was light before."""
+    image = noisy(clean, 500.0, 3)
+    images = [image, 0.4 * image + 1000.0]
+    fit = pachon.fit_donuts(behind_focus, images, [FIELD] * 2, WAVELENGTH, noll=range(4, 12), **OPTIONS)
+    drawn = [np.asarray(axes.images[0].get_array()) for axes in fit.plot().axes if axes.images]
+    for k in (0, 1):
+        assert np.median(drawn[k][:8]) == pytest.approx(0.0, abs=0.05)
+        assert np.percentile(drawn[k], 99.5) == pytest.approx(1.0, abs=0.01)
+        assert np.nanstd(drawn[4 + k]) == pytest.approx(np.sqrt(fit.chi2[k] / fit.n_pixels[k]), abs=0.1)
 
 
 @pytest.mark.parametrize(

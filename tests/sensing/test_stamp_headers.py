@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from astropy import units as u
 from astropy.io import fits
 from astropy.table import Table
 from donut_images import donut, noisy
@@ -266,3 +267,87 @@ def test_positions_of_a_spreadsheet(tmp_path):
     (tmp_path / "stars.csv").write_text("\ufeffx;y;field_x;field_y\n85;65;0.6;0.9\n")
     stamps = read_stamps(tmp_path / "ccd.fits", positions=tmp_path / "stars.csv", size=91)
     np.testing.assert_array_equal(stamps.images[0], image[20:111, 40:131])
+
+
+def cube_with(path, **columns):
+    """Write a cube of two stamps with a table."""
+    stamps = fits.PrimaryHDU(np.ones((2, 12, 12), np.float32))
+    fits.HDUList([stamps, fits.BinTableHDU(Table(columns))]).writeto(path)
+    return path
+
+
+def test_units_of_columns_count(tmp_path):
+    """Radians and millimetres were read as degrees and micrometres."""
+    path = cube_with(
+        tmp_path / "a.fits",
+        field_x=[0.01, 0.02] * u.rad,
+        field_y=[36.0, 72.0] * u.arcsec,
+        defocus_um=[1.5, -1.5] * u.mm,
+    )
+    stamps = read_stamps(path)
+    np.testing.assert_allclose(stamps.fields, [(0.01, np.deg2rad(0.01)), (0.02, np.deg2rad(0.02))], rtol=1e-14)
+    np.testing.assert_allclose(stamps.defocus, [1.5e-3, -1.5e-3], rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("columns", "part"),
+    [
+        ({"field_x": [0.1, np.nan], "field_y": [0.1, 0.2]}, "field_x = nan in row 2: expected a finite number"),
+        ({"field_x": ["a", "b"], "field_y": [0.1, 0.2]}, "column field_x of shape (2,)"),
+        ({"field_x": [0.1, 0.2] * u.mm, "field_y": [0.1, 0.2]}, "column field_x in mm: expected deg"),
+        ({"field_x": [0.1, 0.2]}, "columns field_x: expected x and y [pixels], field_x and field_y [deg]"),
+    ],
+)
+def test_bad_columns_name_file_and_row(tmp_path, columns, part):
+    path = cube_with(tmp_path / "a.fits", **columns)
+    with pytest.raises(ProductError) as raised:
+        read_stamps(path)
+    assert part in str(raised.value)
+    assert str(path) in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("x,y,field_x,field_y\n,20,0.6,0.9\n30,20,0.1,0.2\n", "x = nan in row 1: expected a finite number"),
+        ("x,y,field_x,field_y\nnan,20,0.6,0.9\n", "x = nan in row 1: expected a finite number"),
+        ("x,y,field_x,field_y\n", "table of 0 rows: expected one row a stamp"),
+        ("X_IMAGE,Y_IMAGE\n20,20\n", "columns X_IMAGE, Y_IMAGE: expected x and y [pixels]"),
+        ("", "columns none: expected x and y [pixels]"),
+    ],
+)
+def test_bad_positions_name_file_and_row(tmp_path, text, part):
+    """A number that is left out was read as 0."""
+    fits.PrimaryHDU(np.ones((40, 50), np.float32)).writeto(tmp_path / "ccd.fits")
+    (tmp_path / "stars.csv").write_text(text)
+    with pytest.raises(ProductError) as raised:
+        read_stamps(tmp_path / "ccd.fits", positions=tmp_path / "stars.csv", size=16)
+    assert part in str(raised.value)
+    assert "stars.csv" in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "value"),
+    [
+        ("ERR", None, 3.0),
+        ("UNCERT", "StdDevUncertainty", 3.0),
+        ("UNCERT", "VarianceUncertainty", 9.0),
+        ("UNCERT", "InverseVariance", 1.0 / 9.0),
+    ],
+)
+def test_planes_of_standard_deviations(tmp_path, name, kind, value):
+    """Extensions ERR, and UNCERT of astropy's CCDData, were taken for images of donuts."""
+    image = np.ones((12, 12))
+    plane = fits.ImageHDU(np.full_like(image, value), name=name)
+    if kind is not None:
+        plane.header["UTYPE"] = kind
+    fits.HDUList([fits.PrimaryHDU(image), plane]).writeto(tmp_path / "a.fits")
+    stamps = read_stamps(tmp_path / "a.fits")
+    assert len(stamps) == 1
+    np.testing.assert_allclose(stamps.variances[0], 9.0, rtol=1e-14)
+
+
+def test_small_stamps_are_said_to_be(tmp_path):
+    fits.PrimaryHDU(np.ones((2, 7, 7))).writeto(tmp_path / "a.fits")
+    with pytest.raises(ProductError, match=r"image of shape \[2, 7, 7\]: expected .* of at least 8 pixels a side"):
+        read_stamps(tmp_path / "a.fits")
