@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from astropy import units as u
 
 from ..core.errors import ProductError
 from ..core.files import parsing
@@ -74,7 +75,11 @@ class DonutBench:
             def stacked(names: list[str]) -> np.ndarray:
                 return np.stack([np.asarray(columns[name], dtype=float) for name in names], axis=-1)
 
-            zernikes, errors = (stacked([f"z{j}{end}" for j in noll]) for end in ("", "_err"))
+            units = [getattr(columns[f"z{j}"], "unit", None) or u.nm for j in noll]
+            if any(not unit.is_equivalent(u.nm) for unit in units):
+                raise ProductError(f"Zernikes in {units[0]}: expected lengths", file=path)
+            in_nm = np.array([unit.to(u.nm) for unit in units])
+            zernikes, errors = (in_nm * stacked([f"z{j}{end}" for j in noll]) for end in ("", "_err"))
             [fwhm] = stacked(["fwhm"]).T
             words = [str(word) for word in columns["reasons"]]
             return cls(path.stem, noll, zernikes, errors, stacked(["field_x", "field_y"]), fwhm, words)

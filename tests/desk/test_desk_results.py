@@ -140,6 +140,15 @@ def test_stamps_of_donuts_are_image_model_and_difference(tmp_path):
     assert bench.images(2) is None
 
 
+def test_zernikes_of_a_table_in_micrometres_are_shown_in_nanometres(tmp_path):
+    path = donut_table(tmp_path / "donuts.ecsv")
+    expected, table = DonutBench.read(path).zernikes, QTable.read(path)
+    for name in ("Z4", "Z4_err", "Z5", "Z5_err"):
+        table[name] = table[name].to(u.um)
+    table.write(path, overwrite=True)
+    np.testing.assert_allclose(DonutBench.read(path).zernikes, expected, rtol=1e-6)
+
+
 def test_a_night_has_the_rows_of_its_visits_in_the_order_of_time(tmp_path):
     bench = NightBench(night_folder(tmp_path / "night"))
     assert (list(bench.visits), bench.bands, bench.failed) == (["7", "5"], ("r", "i"), 1)
