@@ -122,7 +122,7 @@ class _Grid:
         if self.whole_sky:
             hours = [(self.ra - offset) % 360.0 for offset in range(-150, 151, 30)]
             axes.set_xticklabels([f"{value:.0f}°" for value in hours], fontsize=6)
-            axes.set_latitude_grid(30)
+            axes.set_yticks(np.deg2rad([-60.0, -30.0, 0.0, 30.0, 60.0]))
             return
         axes.set(xlabel="right ascension [deg]", ylabel="declination [deg]")
         axes.set_xlim(self.ra + self._offset[-1], self.ra + self._offset[0])
