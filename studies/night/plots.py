@@ -43,7 +43,7 @@ def maps_plot(maps: NightMaps) -> bytes:
                 axes = figure.add_subplot(len(bands), 3, 3 * row + column + 1, projection=grid.projection)
                 valid = content[content.valid_pixels]
                 scale = Normalize(0.0 if column == _COUNTED else valid.min(), valid.max())
-                style = {"cmap": colours, "norm": scale, "rasterized": True}
+                style: dict[str, Any] = {"cmap": colours, "norm": scale, "rasterized": True}
                 if grid.dotted:
                     axes.scatter(*grid.dots, c=content[grid.dot_pixels], s=_DOT, linewidths=0.0, zorder=1.0, **style)
                 image = axes.pcolormesh(*grid.mesh, grid.values(content), zorder=1.1, **style)
