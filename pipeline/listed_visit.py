@@ -119,7 +119,10 @@ def visit_experiment(config: Configuration, visit: ListedVisit, folder: Path | N
 
 
 def check_bands(config: Configuration, visits: VisitList, folder: Path | None = None) -> None:
-    """Raise the error of a band of a list that the telescope has not: that of its first visit, where three fail."""
+    """Raise the error of a band of a list that the telescope has not: that of its first visit, where three fail.
+
+    Where they fail by what the list says of them, such as a low altitude, the band is another matter.
+    """
     for band in np.unique(visits.band):
         of_band = np.flatnonzero(visits.band == band)
         errors: list[PachonError] = []
@@ -130,7 +133,19 @@ def check_bands(config: Configuration, visits: VisitList, folder: Path | None = 
             except PachonError as error:
                 errors.append(error)
         else:
-            raise errors[0].within(subject=f"band {band}, {len(of_band)} visits of {visits.source}")
+            if not _has_band(config, str(band), folder):
+                raise errors[0].within(subject=f"band {band}, {len(of_band)} visits of {visits.source}")
+
+
+def _has_band(config: Configuration, band: str, folder: Path | None) -> bool:
+    """Return whether a configuration has an experiment in a band, whatever the visits."""
+    content = config.as_dict() | {"band": band}
+    try:
+        content["telescope"] = telescope_of_band(config.telescope, band, folder)
+        Experiment.from_config(configuration_of(content, f"band {band}"), folder)
+    except PachonError:
+        return False
+    return True
 
 
 def visit_cards(experiment: Experiment, ccd: str) -> list[Card]:

@@ -78,11 +78,22 @@ class ListColumns:
         """Return a quantity that every visit must have; DomainError names the first that has not, and how many."""
         numbers = self.numbers(key)
         with np.errstate(invalid="ignore"):
-            wrong = np.flatnonzero(~(np.isfinite(numbers) & valid(numbers)))
+            self._check(key, numbers, np.isfinite(numbers) & valid(numbers), expected)
+        return numbers
+
+    def stated(self, key: str, valid: Callable[[np.ndarray], np.ndarray], expected: str) -> np.ndarray:
+        """Return a quantity, NaN where a visit has none; DomainError names the first value that cannot be."""
+        numbers = self.numbers(key)
+        with np.errstate(invalid="ignore"):
+            self._check(key, numbers, np.isnan(numbers) | (np.isfinite(numbers) & valid(numbers)), expected)
+        return numbers
+
+    def _check(self, key: str, numbers: np.ndarray, possible: np.ndarray, expected: str) -> None:
+        """Raise DomainError of the first visit of a mask that is false, and of how many there are."""
+        wrong = np.flatnonzero(~possible)
         if wrong.size:
             name = self.source.get(key, QUANTITIES[key].names[0])
             raise self.visit_error(wrong, f"{name} = {_shown(numbers[wrong[0]], QUANTITIES[key].unit)}", expected, name)
-        return numbers
 
     def visit_error(self, wrong: np.ndarray, value: str, expected: str, name: str) -> DomainError:
         """Return the error of the first of some visits."""
@@ -97,16 +108,17 @@ def _in_si(values: np.ndarray, file_unit: Any, unit: str, name: str) -> np.ndarr
     """Return a column in SI units, angles in radians; dates stay days."""
     if values.dtype.kind == "U":
         values = _as_numbers(values, name)
-    if not unit or unit in ("mag", "pixel"):
+    if not unit or unit == "mag":
         return values
     default = u.Unit(unit)
     column_unit = default if file_unit is None else file_unit
-    target = {"angle": u.rad, "time": default, "length": u.m, "speed": u.m / u.s}
-    kind = next(name for name in target if name in default.physical_type)
+    units = {"angle": u.rad, "length": u.m, "speed": u.m / u.s}
+    target = next((units[kind] for kind in units if kind in default.physical_type), default)
     try:
-        return np.asarray((values * column_unit).to_value(target[kind]), dtype=np.float64)
-    except (u.UnitsError, TypeError, AttributeError):
-        raise DomainError(f"column {name} in {file_unit}: expected a unit such as {unit}", key=name) from None
+        return np.asarray((values * column_unit).to_value(target), dtype=np.float64)
+    except (u.UnitsError, ValueError, TypeError, AttributeError):
+        shown = str(file_unit) or "pure numbers"
+        raise DomainError(f"column {name} in {shown}: expected a unit such as {unit}", key=name) from None
 
 
 def _as_numbers(texts: np.ndarray, name: str) -> np.ndarray:
@@ -125,7 +137,7 @@ def _as_numbers(texts: np.ndarray, name: str) -> np.ndarray:
 
 def _shown(value: float, unit: str) -> str:
     """Return a number of a message in the unit of lists."""
-    if not np.isfinite(value):
+    if np.isnan(value):
         return "nothing"
     factor = {"deg": np.rad2deg(1.0), "arcsec": 1.0 / ARCSEC}.get(unit, 1.0)
     return f"{value * factor:.6g} {unit}".strip()

@@ -10,6 +10,7 @@ import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -25,6 +26,8 @@ _TABLES = ("observations", "summaryallprops", "summary", "visit1", "visits")
 _SQLITE = b"SQLite format 3\x00"
 #: Rows that are fetched at once.
 _ROWS = 10_000
+#: Of SQLite's whole numbers, of 64 bits.
+_LARGEST_INTEGER = 2**63 - 1
 #: Bytes and lines before which the header of an instance catalogue must end: its objects may be gigabytes.
 _HEADER_BYTES = 1 << 16
 _HEADER_LINES = 1000
@@ -162,10 +165,21 @@ def _fill(connection: sqlite3.Connection, columns: Mapping[str, Any]) -> tuple[s
 
 
 def _plain_list(values: Any) -> list[Any]:
-    """Return a column as numbers and texts of Python, None where it is empty."""
-    plain = np.ma.asarray(values)
-    items = [item.decode("utf-8", "replace") if isinstance(item, bytes) else item for item in plain.tolist()]
-    return [None if isinstance(item, float) and np.isnan(item) else item for item in items]
+    """Return a column as numbers and texts of Python, None where it is empty; times are MJD in TAI."""
+    from astropy.time import Time
+
+    return [_stored(item) for item in np.ma.asarray(values.tai.mjd if isinstance(values, Time) else values).tolist()]
+
+
+def _stored(item: Any) -> Any:
+    """Return a value as SQLite stores it: a number, a text, or None; others, such as dates and lists, as texts."""
+    if isinstance(item, Decimal) or (isinstance(item, int) and abs(item) > _LARGEST_INTEGER):
+        return float(item)
+    if isinstance(item, float):
+        return None if np.isnan(item) else item
+    if isinstance(item, bytes):
+        return item.decode("utf-8", "replace")
+    return item if item is None or isinstance(item, (int, str)) else str(item)
 
 
 def _column_array(values: Sequence[Any]) -> np.ndarray:

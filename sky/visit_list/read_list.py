@@ -35,6 +35,8 @@ _BANDS = "ugrizy"
 # Angle of an LSST pixel, in which ConsDB has widths [rad].
 _CONSDB_PIXEL = 0.2 * ARCSEC
 _SECONDS_A_DAY = 86400.0
+# Brightest and darkest sky [mag/arcsec^2]: between twilight and what marks an unknown sky, such as 0 or 99.
+_SKIES = 5.0, 35.0
 
 
 @check_arguments
@@ -97,7 +99,9 @@ def read_visit_list(
         rows = _selection(columns, band, night)
         columns = columns.rows(rows)
         if not len(columns):
-            wanted = ", ".join(f"{name} {value}" for name, value in (("band", band), ("night", night)) if value)
+            wanted = ", ".join(
+                f"{name} {value}" for name, value in (("band", band), ("night", night)) if value is not None
+            )
             raise DomainError(f"no visit of {wanted}: expected at least one")
         return _visits(columns, path, camera, location, outer_scale, airmass_law)
 
@@ -120,8 +124,10 @@ def _visits(
     altitude, azimuth = _horizontal(columns, angles)
     rotator = rotator_angles(columns, angles.zenith_position_angle, camera)
     roll = columns.numbers("roll")
-    scale = columns.numbers("outer_scale", outer_scale)
-    epoch = columns.values["epoch"].astype(np.int64) if "epoch" in columns.values else number
+    scale = columns.stated("outer_scale", lambda length: length > 0.0, "a length above 0 m")
+    scale = np.where(np.isnan(scale), outer_scale, scale)
+    epoch = columns.stated("epoch", _is_whole, "a whole number from 0")
+    epoch = np.where(np.isnan(epoch), number, np.nan_to_num(epoch).astype(np.int64))
     return VisitList(
         visit=number,
         band=band,
@@ -137,11 +143,13 @@ def _visits(
         snaps=snaps,
         r0=_fried_parameters(columns, scale, altitude, airmass_law),
         outer_scale=scale,
-        wind_speed=columns.numbers("wind_speed"),
+        wind_speed=columns.stated("wind_speed", lambda speed: speed >= 0.0, "a speed from 0 m/s"),
         wind_azimuth=columns.numbers("wind_azimuth"),
-        sky=columns.numbers("sky"),
+        sky=columns.stated(
+            "sky", lambda sky: (sky > _SKIES[0]) & (sky < _SKIES[1]), "{:g} to {:g} mag".format(*_SKIES)
+        ),
         epoch=epoch,
-        weight=columns.numbers("weight"),
+        weight=columns.stated("weight", lambda weight: weight > 0.0, "a weight above 0"),
         source=path.name,
         remarks=tuple(columns.remarks),
     )
@@ -154,9 +162,12 @@ def _visit_numbers(columns: ListColumns) -> np.ndarray:
         return np.arange(1, len(columns) + 1)
     values = columns.values["visit"]
     name = columns.source["visit"]
-    whole = values.dtype.kind == "i" or (values.dtype.kind == "f" and bool((values == np.round(values)).all()))
-    if not whole or values.min() < 0:
-        raise DomainError(f"column {name}: expected whole numbers from 0 in every row", key=name)
+    wrong = np.flatnonzero(~_is_whole(values))
+    if wrong.size:
+        value = "nothing" if np.isnan(values[wrong[0]]) else f"{values[wrong[0]]:.15g}"
+        raise DomainError(
+            f"column {name}, row {wrong[0] + 1}: {value}: expected whole numbers from 0 in every row", key=name
+        )
     numbers = values.astype(np.int64)
     unique, counts = np.unique(numbers, return_counts=True)
     if (counts > 1).any():
@@ -168,11 +179,24 @@ def _visit_numbers(columns: ListColumns) -> np.ndarray:
     return numbers
 
 
+def _is_whole(values: np.ndarray) -> np.ndarray:
+    """Return whether numbers are whole, not negative, and no larger than those of 64 bits."""
+    return np.asarray((values >= 0) & (values == np.round(values)) & (values < 2.0**63))
+
+
 def _exposure_times(columns: ListColumns, snaps: np.ndarray) -> np.ndarray:
     """Return the times of all snaps together [s]."""
     key = columns.require("exposure", "visit_time")
     times = columns.complete(key, lambda seconds: seconds > 0.0, "a time above 0 s")
-    return times - CATALOGUE_READOUT * (snaps - 1) if key == "visit_time" else times
+    if key == "exposure":
+        return times
+    readout = CATALOGUE_READOUT * (snaps - 1)
+    wrong = np.flatnonzero(times <= readout)
+    if wrong.size:
+        name, first = columns.source[key], wrong[0]
+        expected = f"more than {readout[first]:g} s between {snaps[first]} snaps"
+        raise columns.visit_error(wrong, f"{name} = {times[first]:g} s", expected, name)
+    return times - readout
 
 
 def _midpoints(columns: ListColumns, exposure: np.ndarray, snaps: np.ndarray) -> np.ndarray:
@@ -286,8 +310,10 @@ def _fried_parameters(
     if key == "psf_seeing":
         columns.remarks.append(f"{columns.source[key]} has the telescope in it, which is then in twice")
         seeing = seeing * (_CONSDB_PIXEL * FWHM_PER_RMS)
-    if np.median(seeing) > 30.0 * ARCSEC or np.median(seeing) < 0.02 * ARCSEC:
-        raise DomainError(f"column {columns.source[key]}: expected widths in arcsec", key=columns.source[key])
+    middle = float(np.median(seeing)) / ARCSEC
+    if not 0.02 <= middle <= 30.0:
+        name = columns.source[key]
+        raise DomainError(f"column {name}: its median is {middle:.3g} arcsec: expected widths in arcsec", key=name)
     growth = (1.0 / np.sin(altitude)) ** 0.6 if airmass_law == "opsim" else np.ones(len(columns))
     try:
         along_sight = fried_parameter(seeing * growth, outer_scale)

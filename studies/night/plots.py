@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
 
 from ...core.plotting import new_figure, png_bytes, styled
 from ...measure.correlation_plots import draw_correlation, log_axes
@@ -16,13 +17,17 @@ from .residual_correlation import MeanCorrelation
 
 _LABELS = {"truth": (TRUTH, "o", "noise-free PSFs"), "away": (AWAY, "^", "less the models, where no star is")}
 _TITLES = ("rms width of the PSF [pixel]", "limiting magnitude (AB, S/N 5)", "visits")
-_COLOURS = ("viridis", "cividis", "magma")
+_COLOURS = ("viridis", "cividis", "magma_r")
 #: Place of the number of visits among the titles, which begins at zero.
 _COUNTED = 2
 #: Points of the grid on which a map is drawn, along its longer side.
 _GRID = 480
 #: Widest part of the sky [deg] that is drawn in a plane; a wider one by Hammer's equal-area projection.
 _WIDEST_PLANE = 60.0
+#: Least side of a part of the sky [deg] on which a CCD would be too small to be seen, and has a dot.
+_DOTTED = 10.0
+#: Area of a dot [pt^2].
+_DOT = 5.0
 _MARGIN = 0.04
 
 
@@ -36,9 +41,12 @@ def maps_plot(maps: NightMaps) -> bytes:
             grid = _Grid(pictured[0])
             for column, (content, title, colours) in enumerate(zip(pictured, _TITLES, _COLOURS, strict=True)):
                 axes = figure.add_subplot(len(bands), 3, 3 * row + column + 1, projection=grid.projection)
-                values = grid.values(content)
-                least = 0.0 if column == _COUNTED else None
-                image = axes.pcolormesh(*grid.mesh, values, cmap=colours, vmin=least, rasterized=True)
+                valid = content[content.valid_pixels]
+                scale = Normalize(0.0 if column == _COUNTED else valid.min(), valid.max())
+                style: dict[str, Any] = {"cmap": colours, "norm": scale, "rasterized": True}
+                if grid.dotted:
+                    axes.scatter(*grid.dots, c=content[grid.dot_pixels], s=_DOT, linewidths=0.0, zorder=1.0, **style)
+                image = axes.pcolormesh(*grid.mesh, grid.values(content), zorder=1.1, **style)
                 figure.colorbar(image, ax=axes, shrink=0.7)
                 axes.set_title(f"{band}: {title}", loc="left", fontsize=9)
                 grid.label(axes)
@@ -80,6 +88,12 @@ class _Grid:
             across = margin / max(np.cos(np.deg2rad(0.5 * (low + high))), 0.02)
             self._offset = np.linspace(offset.min() - across, offset.max() + across, _GRID)
             self._dec = np.linspace(max(low - margin, -90.0), min(high + margin, 90.0), _GRID)
+        #: Whether a CCD is too small to be seen, and has a dot.
+        self.dotted = max(float(np.ptp(self._offset)) * np.cos(north.mean()), high - low) > _DOTTED
+        cells = [np.searchsorted(axis, at) for axis, at in ((self._offset, offset), (self._dec, dec))]
+        first = np.unique(cells, axis=1, return_index=True)[1]
+        self.dot_pixels = content.valid_pixels[first]  #: pixels that have a dot, one a cell
+        self.dots = self._axes(offset[first], np.asarray(dec)[first])  #: their places on the axes
 
     @property
     def projection(self) -> str | None:
@@ -87,10 +101,14 @@ class _Grid:
 
     @property
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates of the axes: east is at the left."""
+        """Points of the grid on the axes."""
+        return self._axes(self._offset, self._dec)
+
+    def _axes(self, offset: np.ndarray, dec: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return offsets in right ascension and declinations [deg] as the axes have them: east is at the left."""
         if self.whole_sky:
-            return np.deg2rad(-self._offset), np.deg2rad(self._dec)
-        return self.ra + self._offset, self._dec
+            return np.deg2rad(-offset), np.deg2rad(dec)
+        return self.ra + offset, dec
 
     def values(self, content: Any) -> np.ndarray:
         """Return a map at the points, masked where it has nothing."""
@@ -104,6 +122,7 @@ class _Grid:
         if self.whole_sky:
             hours = [(self.ra - offset) % 360.0 for offset in range(-150, 151, 30)]
             axes.set_xticklabels([f"{value:.0f}°" for value in hours], fontsize=6)
+            axes.set_yticks(np.deg2rad([-60.0, -30.0, 0.0, 30.0, 60.0]))
             return
         axes.set(xlabel="right ascension [deg]", ylabel="declination [deg]")
         axes.set_xlim(self.ra + self._offset[-1], self.ra + self._offset[0])

@@ -1,7 +1,9 @@
 """Visit lists: angles by spherical trigonometry and astropy, air by Tokovinin's formula, formats by each other."""
 
+import datetime
 import sqlite3
 from contextlib import closing
+from decimal import Decimal
 
 import numpy as np
 import pytest
@@ -359,7 +361,16 @@ def changed(name, index, value):
         (changed("fieldDec", 0, 95.0), "visit 1001: fielddec = 95 deg: expected -90 to 90 deg"),
         (changed("visitExposureTime", 0, -3.0), "visit 1001: visitexposuretime = -3 s: expected a time above 0 s"),
         (changed("observationId", 1, 3.5), "expected whole numbers from 0"),
+        (changed("observationId", 1, 1e20), "column observationid, row 2: 1e+20: expected whole numbers from 0"),
         (changed("fieldRA", 1, "12h"), "column fieldra, row 2: '12h': expected a number"),
+        (changed("fieldRA", 1, "inf"), "visit 1002: fieldra = inf deg: expected a finite angle"),
+        (changed("skyBrightness", 2, 0), "visit 1003: skybrightness = 0 mag: expected 5 to 35 mag"),
+        (changed("seeingFwhm500", slice(5), [3e-6] * 5), "its median is 3e-06 arcsec: expected widths in arcsec"),
+        ({"outer_scale": [20, 20, -20, 20, 20]}, "visit 1003: outer_scale = -20 m: expected a length above 0 m"),
+        ({"outer_scale": [20, 20, "inf", 20, 20]}, "visit 1003: outer_scale = inf m: expected a length above 0 m"),
+        ({"weight": [1, 0, -1, 1, 1]}, "visit 1002: weight = 0: expected a weight above 0; 2 of 5 visits are so"),
+        ({"epoch": [1, 2, 2.5, 3, 4]}, "visit 1003: epoch = 2.5: expected a whole number from 0"),
+        ({"wind_speed": [1, -2, 1, 1, 1]}, "visit 1002: wind_speed = -2 m/s: expected a speed from 0 m/s"),
     ],
 )
 def test_values_that_cannot_be(write_list, changes, message):
@@ -369,14 +380,77 @@ def test_values_that_cannot_be(write_list, changes, message):
     assert "visits.csv" in str(error.value)
 
 
+def test_what_a_visit_leaves_open(write_list):
+    columns = {name: [7, "", 8, 9, 10] for name in ("epoch", "outer_scale", "weight", "wind_speed")}
+    visits = read_visit_list(write_list(**columns))
+    assert visits.epoch.tolist() == [7, 1002, 8, 9, 10]
+    assert visits.outer_scale.tolist() == [7.0, 25.0, 8.0, 9.0, 10.0]
+    assert np.isnan([visits.weight[1], visits.wind_speed[1]]).all()
+
+
+def test_snaps_of_an_instance_catalogue_take_time(tmp_path):
+    path = tmp_path / "instcat.txt"
+    header = "rightascension 53\ndeclination -28\nmjd 61001.2\nfilter 2\nrottelpos 1\nseeing 0.7\nobshistid 7\n"
+    path.write_text(header + "nsnap 12\nvistime 33\n")
+    with pytest.raises(DomainError, match="visit 7: vistime = 33 s: expected more than 33 s between 12 snaps"):
+        read_visit_list(path)
+
+
+@pytest.mark.parametrize("kind", ["decimal", "mapping", "time of day", "long whole number", "list"])
+def test_columns_of_other_types(visits, tmp_path, kind):
+    """What no visit needs does not matter; decimals are numbers."""
+    parquet = pytest.importorskip("pyarrow.parquet")
+    import pyarrow
+
+    value = {"decimal": Decimal("1.5"), "mapping": {"a": 1}, "time of day": datetime.time(1, 2), "list": [1, 2],
+             "long whole number": np.uint64(2**63 + 5)}[kind]  # fmt: skip
+    columns = {name: column(name).tolist() for name in COLUMNS} | {"other": [value] * 5}
+    columns["fieldRA"] = [Decimal(str(ra)) for ra in column("fieldRA")]
+    path = tmp_path / "visits.parquet"
+    parquet.write_table(pyarrow.table(columns), path)
+    same_visits(read_visit_list(path), visits)
+
+
+def test_times_and_positions_of_astropy(visits, tmp_path):
+    table = QTable({name: column(name) for name in COLUMNS})
+    table["observationStartMJD"] = Time(column("observationStartMJD"), format="mjd", scale="tai").utc
+    table["target"] = SkyCoord(column("fieldRA") * u.deg, column("fieldDec") * u.deg)
+    path = tmp_path / "visits.ecsv"
+    table.write(path)
+    same_visits(read_visit_list(path), visits)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "message"),
+    [
+        ("fieldRA", "furlong", "column fieldra in furlong: expected a unit such as deg"),
+        ("fieldRA", "", "column fieldra in pure numbers: expected a unit such as deg"),
+        ("seeing_zenith_500nm_median", "arcsec", "seeing_zenith_500nm_median in arcsec: expected a unit such as pixel"),
+    ],
+)
+def test_units_that_cannot_be(tmp_path, name, unit, message):
+    table = Table({key: column(key) for key in COLUMNS})
+    table.rename_column("seeingFwhm500", "seeing_zenith_500nm_median")
+    table[name].unit = u.dimensionless_unscaled if unit == "" else u.Unit(unit, parse_strict="silent")
+    path = tmp_path / "visits.ecsv"
+    table.write(path)
+    with pytest.raises(DomainError, match=message):
+        read_visit_list(path)
+
+
 def test_small_outer_scales_allow_less(write_list):
     with pytest.raises(DomainError, match=r"expected at least .* with an outer scale of 1 m"):
         read_visit_list(write_list(outer_scale=[1.0] * 5))
 
 
 def test_selections_without_a_visit(write_list):
-    for options in ({"where": "band = 'u'"}, {"band": "u"}, {"night": 3}, {"night": 20200101}):
-        with pytest.raises(DomainError, match="no visit"):
+    for options, wanted in (
+        ({"where": "band = 'u'"}, "with band = 'u'"),
+        ({"band": "u"}, "of band u"),
+        ({"night": 0}, "of night 0"),
+        ({"night": 20200101}, "of night 20200101"),
+    ):
+        with pytest.raises(DomainError, match=f"no visit {wanted}: "):
             read_visit_list(write_list(), **options)
     with pytest.raises(ConfigError, match="expected a date"):
         read_visit_list(write_list(), night=20251399)

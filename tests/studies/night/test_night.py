@@ -1,6 +1,7 @@
 """Nights of visit lists: what comes out, with what bytes, and what is said of visits that fail."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from pachon.commands.night import listed_visit
 from pachon.core.errors import ConfigError, DomainError, ProductError
 from pachon.core.long_work import Execution
 from pachon.core.products import read_fits
+from pachon.pipeline.listed_visit import check_bands
 from pachon.studies.night.night import run_night
 from pachon.studies.night.visit_product import VisitWork
 
@@ -156,6 +158,17 @@ def test_bands_that_the_telescope_has_not(night_config, tmp_path):
     with pytest.raises(ConfigError, match=r"band i, 1 visits of visits.csv: .*has no band i"):
         run_night(night_config({"telescope": "comcam_r", "ccds": None}), tmp_path / "night")
     assert not (tmp_path / "night").exists()
+
+
+def test_a_band_of_visits_that_fail_is_one_of_the_telescope(night_config):
+    """Visits below the range of the optics are left out later, one by one, though a band has no others."""
+    night = night_config()
+    visits = night.read_list()
+    low = replace(visits, altitude=np.where(visits.band == "i", np.deg2rad(4.0), visits.altitude))
+    check_bands(night.run, low)
+    comcam = night_config({"telescope": "comcam_r", "ccds": None})
+    with pytest.raises(ConfigError, match="has no band i"):
+        check_bands(comcam.run, low)
 
 
 def test_settings_that_do_not_fit(night_config, tmp_path):
