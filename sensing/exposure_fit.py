@@ -12,33 +12,29 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
-from ..core.units import radians
 from ..design.metrics.field_zernikes import wavefront_zernikes
 from ..design.optimize.sensitivity import sensitivity
 from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ..models.parameters.tolerances import Tolerance
 from ..models.telescope import Telescope
-from ..models.zernike_polynomials import annular_zernikes, noll_to_nm
 from ..wavefront.atmosphere.atmosphere import Atmosphere
 from .air_shape import air_shape
 from .degrees import FreedomEstimate, prior_spreads
 from .exposure import ExposureWavefront
 from .fit_star import StarFit
-from .flags import DonutFlag
 from .hierarchy import Basis, Hierarchy, Observations, fit_hierarchy, star_numbers
 from .image_model import STRENGTH
 from .inputs import noll_indices, small_length
 from .light import Instrument
 from .moving_rims import FreeRims
 from .shared_rims import shared_rims
-from .sides import SideAgreement, SideFit, decide_sides, pair_agreement
+from .sided_stars import FIELD_NOLL, SAME_STAR, air_of_zernikes, field_basis, relative_outer_scale, sided_stars
+from .sides import SideAgreement, pair_agreement
 from .star_errors import StarErrors, star_errors
 from .star_fitter import StarSolution
 from .terms import WavefrontTerms
 from .wavefront_fits import NOLL, FittedStar, FittedStars, UsableStars, WavefrontFit
 
-#: Terms over the field: up to the second degree.
-_FIELD_NOLL = tuple(range(1, 7))
 #: Terms up to the eleventh radial degree, which the air has beside those asked for.
 _AIR_TERMS = 78
 #: Rms of terms up to Z22 that are left out, as in single fits [m].
@@ -47,8 +43,6 @@ _LEFT_OUT = 200e-9
 _SLIGHT_AIR = 60e-9
 #: Largest rms of the air's wavefront of the prior of its higher terms [m].
 _MOST_AIR = 400e-9
-#: Distance within which donuts on both sides of focus are of one star, if no names are given [rad]: 36 arcsec.
-_SAME_STAR = np.deg2rad(0.01)
 #: Root of the summed squares of the donuts' own wavefronts beyond which they are of no one exposure [m].
 _UNLIKE = 500e-9
 
@@ -89,7 +83,7 @@ class ExposureDonuts(WavefrontFit):
 
     joint: ClassVar[bool] = False
 
-    field_noll: Iterable[int] = _FIELD_NOLL
+    field_noll: Iterable[int] = FIELD_NOLL
     noll: Iterable[int] = NOLL
     higher_order: ArrayLike = 10e-9
     freedoms: DegreesOfFreedom | None = None
@@ -128,7 +122,7 @@ class ExposureDonuts(WavefrontFit):
         terms, telescope = instrument.terms, instrument.telescope
         noll = np.arange(4, max(_AIR_TERMS, int(terms.every.max())) + 1)
         further = np.concatenate([terms.further, np.setdiff1d(noll, terms.every)])
-        variance = np.diag(air_shape(int(noll[-1]), telescope.pupil_obscuration, _outer_scale(instrument)))
+        variance = np.diag(air_shape(int(noll[-1]), telescope.pupil_obscuration, relative_outer_scale(instrument)))
         variance = min(exposure.air_rms, _MOST_AIR) ** 2 * variance[further - 4]
         variance[: len(terms.further)] += 1.0 / terms.precision[len(terms.requested) :]
         precision = np.concatenate([np.zeros(len(terms.requested)), 1.0 / variance])
@@ -137,26 +131,7 @@ class ExposureDonuts(WavefrontFit):
 
     def sided(self, instrument: Instrument, stars: Sequence[StarFit], fields: np.ndarray) -> list[StarFit]:
         """Return the stars with flags by the side of focus that all of them together say."""
-        donuts, numbers = [star.sides for star in stars], self._stars(fields)
-
-        def smoothness(index: np.ndarray, fits: Sequence[SideFit]) -> float:
-            star = numbers[index]
-            observations = Observations(
-                np.array([fit.zernikes for fit in fits]),
-                np.array([fit.covariance for fit in fits]),
-                star,
-                np.zeros(len(star), dtype=np.int64),
-            )
-            return fit_hierarchy(observations, self._field_basis(instrument, fields[index]), _shape(instrument)).loss
-
-        decision = decide_sides(donuts, smoothness)
-        changed = []
-        for star, wrong, decided in zip(stars, decision.wrong, decision.decided, strict=True):
-            if wrong:
-                changed.append(StarFit(DonutFlag.DEFOCUS_SIGN, sides=star.sides))
-            else:
-                changed.append(replace(star, flags=star.flags & ~DonutFlag.AMBIGUOUS_SIDE) if decided else star)
-        return changed
+        return sided_stars(instrument, stars, fields, self._stars(fields), self.field_noll)
 
     def solved(self, usable: UsableStars, pool: Executor) -> FittedStars:
         """Return the telescope's wavefront at each star, with what the scatter of all says of the air."""
@@ -172,14 +147,14 @@ class ExposureDonuts(WavefrontFit):
         star = self._stars(usable.every_field)[usable.index]
         paired = [len(set(behind[star == number])) > 1 for number in np.unique(star)]
         exposure = behind.astype(np.int64) if any(paired) else np.zeros(count, dtype=np.int64)
-        observations, shape = Observations(zernikes, covariance, star, exposure), _shape(instrument)
+        observations, shape = Observations(zernikes, covariance, star, exposure), air_of_zernikes(instrument)
         air = (
             1e-12 if instrument.known_seeing and not any(s.solution.stars[0][STRENGTH] for s in usable.stars) else None
         )
         freedoms = None
         double: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
         if self.freedoms is None:
-            basis = self._field_basis(instrument, usable.fields)
+            basis = field_basis(instrument, usable.fields, self.field_noll)
             hierarchy = fit_hierarchy(observations, basis, shape, air)
             double = hierarchy.terms.reshape(-1, n), hierarchy.term_covariance
         else:
@@ -210,16 +185,7 @@ class ExposureDonuts(WavefrontFit):
         """Return the numbers of the stars of all images."""
         if self.stars is not None and len(self.stars) != len(fields):
             raise DomainError(f"stars of length {len(self.stars)}: expected a number for each of {len(fields)} images")
-        return star_numbers(fields, _SAME_STAR, self.stars)
-
-    def _field_basis(self, instrument: Instrument, fields: np.ndarray) -> Basis:
-        """Return double Zernikes, term by term over the field."""
-        field_noll, noll = np.array(self.field_noll), instrument.terms.requested
-        places = radians(fields, "fields").T / instrument.telescope.field_radius
-        over_field = annular_zernikes(int(field_noll.max()), *places)[field_noll - 1].T
-        columns = np.einsum("ik,ab->iakb", over_field, np.eye(len(noll))).reshape(len(fields), len(noll), -1)
-        field_degree, pupil_degree = (np.array([noll_to_nm(int(j))[0] for j in js]) for js in (field_noll, noll))
-        return Basis(columns, np.repeat(field_degree, len(noll)), np.tile(pupil_degree, len(field_noll)))
+        return star_numbers(fields, SAME_STAR, self.stars)
 
     def _freedoms(
         self, usable: UsableStars, observations: Observations, shape: np.ndarray, air: float | None
@@ -249,18 +215,6 @@ class ExposureDonuts(WavefrontFit):
         hierarchy = replace(hierarchy, telescope=hierarchy.telescope + made, total=hierarchy.total + made)
         covariance = hierarchy.term_covariance * np.outer(spreads, spreads)
         return hierarchy, basis, FreedomEstimate(freedoms, values, covariance, spreads)
-
-
-def _shape(instrument: Instrument) -> np.ndarray:
-    """Return the covariance of the air's terms over that of Z4 to Z22 together."""
-    noll, telescope = instrument.terms.requested, instrument.telescope
-    shape = air_shape(max(22, int(noll.max())), telescope.pupil_obscuration, _outer_scale(instrument))
-    return shape[np.ix_(noll - 4, noll - 4)]
-
-
-def _outer_scale(instrument: Instrument) -> float:
-    """Return the outer scale of the turbulence over the radius of the pupil."""
-    return float(instrument.model.air.outer_scale) / (0.5 * instrument.telescope.pupil_diameter)
 
 
 def _results(

@@ -37,6 +37,7 @@ from .shared_rims import (
     shared_rims,
     with_shared_rims,
 )
+from .sided_stars import sided_stars
 from .solve import Solution, solve
 from .star_errors import ErrorParts, model_floor, star_errors, with_errors
 from .star_fitter import StarSolution
@@ -159,8 +160,8 @@ class WavefrontFit(ABC):
         return replace(star, best=with_errors(instrument, star.usable))
 
     def sided(self, instrument: Instrument, stars: Sequence[StarFit], fields: np.ndarray) -> list[StarFit]:
-        """Return the stars with flags by the side of focus that they say together, where they are compared."""
-        return list(stars)
+        """Return the stars with flags by the side of focus that they say together, if they share unknowns."""
+        return sided_stars(instrument, stars, fields) if self.joint else list(stars)
 
     def refined(self, instrument: Instrument, stars: Sequence[StarSolution], fitted: FittedStars) -> Instrument | None:
         """Return an instrument for which all stars are fitted once more, by what a first fit has found; or None."""

@@ -85,6 +85,17 @@ def test_a_wrong_side_is_said_by_all_donuts_together(focused, pairs):
     assert np.isnan(together.zernikes).all()
 
 
+@pytest.mark.long
+def test_fits_of_shared_unknowns_decide_on_the_side_too(focused, pairs):
+    freedoms = pachon.load_degrees_of_freedom("lsst").select(["M2_dx", "M2_dy", "M2_dz"])
+    of_one_side = {"images": pairs[:2], "fields": FIELDS, "wavelength": WAVELENGTH}
+    for fit in (pachon.sensing.FieldTerms([1]), pachon.sensing.TelescopeFreedoms(freedoms)):
+        right = pachon.fit_donuts(focused, model=of_sides(1, 1), fit=fit, **of_one_side, **OPTIONS)
+        assert not (right.flags & pachon.sensing.DonutFlag.AMBIGUOUS_SIDE).any()
+        with pytest.raises(pachon.errors.DomainError, match="defocus sign"):
+            pachon.fit_donuts(focused, model=of_sides(-1, -1), fit=fit, **of_one_side, **OPTIONS)
+
+
 class Refined(pachon.sensing.ExposureDonuts):
     """Fit that is always refined."""
 
