@@ -95,7 +95,7 @@ class SimulatedDonuts:
 
 
 def changed_telescope(telescope: Telescope, changes: Sequence[str]) -> Telescope:
-    """Return a telescope with changes such as ``M2.dx=200um`` or ``Camera.rx=5arcsec``; bare numbers are m and rad.
+    """Return a telescope with changes such as ``M2.dx=200um`` or ``Camera.rx=5arcsec``.
 
     Raises
     ------
@@ -111,9 +111,7 @@ def changed_telescope(telescope: Telescope, changes: Sequence[str]) -> Telescope
             raise ConfigError(f"--perturb = {text!r}: expected a parameter and its change, such as M2.dx=200um")
         parameter = Parameter.parse(address.strip(), telescope)
         try:
-            quantity = u.Quantity(size.strip())
-            unit = u.Unit(parameter.unit or "")
-            change = float(quantity.value if quantity.unit == u.dimensionless_unscaled else quantity.to_value(unit))
+            change = float(u.Quantity(size.strip()).to_value(u.Unit(parameter.unit or "")))
         except (TypeError, ValueError, u.UnitConversionError):
             raise ConfigError(
                 f"--perturb = {text!r}: expected a size in {parameter.unit or 'pure numbers'}, as 200um or 5arcsec"

@@ -112,6 +112,10 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
         (["plain.fits", "--perturb", "M2.dx=1um"], "--perturb, --set: expected them with --simulate"),
         (["new.fits", "--simulate"], "--defocus-um = 0: expected a shift that makes donuts"),
         (["new.fits", "--simulate", "--perturb", "M2.dx"], "--perturb = 'M2.dx': expected a parameter and its change"),
+        (
+            ["new.fits", "--simulate", "--perturb", "M2.dx=200"],
+            "--perturb = 'M2.dx=200': expected a size in m, as 200um",
+        ),
         (["new.fits", "--simulate", "--perturb", "M2.dx=1arcsec"], "--perturb = 'M2.dx=1arcsec': expected a size in m"),
         (["new.fits", "--simulate", "--set", "star=2"], "--set: unknown key star = 2"),
         (["new.fits", "--simulate", "--set", "stars"], "--set 'stars': expected KEY=VALUE"),
