@@ -30,6 +30,9 @@ def orientation_text(check: OrientationCheck, inputs: DonutInputs) -> str:
     option = ""
     if all((axes == inputs.axes[0]).all() for axes in inputs.axes):
         option = f": try --stamp-axes={stamp_axes_text(inputs.axes[0] @ stamp_matrix(check.best))}"
+    if check.best == "-x,-y":
+        # Beside the axis the other side of focus is much like a half turn.
+        option += ", unless the defocus has the wrong sign"
     return f"stamps fit better mirrored or turned by quarters, {quality} of {len(check.donuts)} donuts{option}"
 
 

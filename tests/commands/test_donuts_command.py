@@ -297,7 +297,7 @@ def test_stamps_turned_by_half_are_not_taken_for_the_other_side_alone(tmp_path, 
     assert main(["donuts", "d.fits", *OPTIONS[2:], "--sky-variance", "300"]) == 0
     captured = capsys.readouterr()
     assert "defocus sign, orientation" in captured.out
-    assert "try --stamp-axes=-x,-y" in captured.err
+    assert "try --stamp-axes=-x,-y, unless the defocus has the wrong sign" in captured.err
 
 
 @pytest.mark.parametrize(
