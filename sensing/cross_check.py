@@ -101,8 +101,9 @@ def cross_checked(
     common = np.mean([parts[i].air for i in group], axis=0)
     told = float(np.trace(common))
     lacking = residuals + freedom * told
-    # Donuts near each other may differ by anything, donuts over the field by the air if the residuals do not say why.
-    middle = told if terms == 1 else max(told, _LEAST_AIR**2)
+    # Donuts near each other look through one air: what they differ by may be anything else.
+    near = bool((np.hypot(*(fields[group] - fields[group].mean(axis=0)).T) < _NEAR).all())
+    middle = told if near else max(told, _LEAST_AIR**2)
     if measured_air and middle > 0.0 and scatter < most + noise + lacking:
         # What donuts share of the air is no part of the scatter.
         own = _AIR_OF_ITS_OWN * freedom

@@ -66,19 +66,21 @@ def joint_errors(
         Their joint solution.
     """
     n, unknowns = len(instrument.terms.requested), len(solution.shared)
-    gains, errors = [], []
-    for star, wave_map in zip(alone, wave_maps, strict=True):
+    gains, errors, donuts = [], [], []
+    for i, (star, wave_map) in enumerate(zip(alone, wave_maps, strict=True)):
         if isinstance(star.errors, StarErrors):
             waves, count = wave_map.shape
             information = np.linalg.pinv(star.solution.shared_covariance[:waves, :waves], hermitian=True)
             # How the shared unknowns follow the star's own wavefront.
             gains.append((solution.shared_covariance[:, :count] @ wave_map.T @ information)[:, :n])
             errors.append(star.errors)
+            donuts.append(i)
     air, figure = np.zeros((2, unknowns, unknowns))
     if errors:
         common = np.sum(gains, axis=0)
         # Residuals of one star say little of the air that all have, and their scatter more.
-        of_air = np.mean([parts.air for parts in checked_parts(instrument, alone, fields)], axis=0)
+        checked = checked_parts(instrument, [alone[i] for i in donuts], fields[donuts])
+        of_air = np.mean([parts.air for parts in checked], axis=0)
         own = np.sum([gain @ of_air @ gain.T for gain in gains], axis=0)
         air = GROUND * common @ of_air @ common.T + (1.0 - GROUND) * own
         figure = common @ np.mean([star_error.figure for star_error in errors], axis=0) @ common.T

@@ -341,7 +341,8 @@ def _levels(image: np.ndarray, background: float) -> tuple[float, float]:
         return 0.0, 1.0
     base = float(background if np.isfinite(background) else np.percentile(finite, 10.0))
     top = float(np.percentile(finite, 99.5))
-    return base, top if top > base else base + 1.0
+    # Of a stamp without contrast one, or as much as a large number has beside itself.
+    return base, top if top > base else base + max(1.0, 1e-6 * abs(base))
 
 
 def _draw(fit: DonutFit, donuts: slice | list[int] | None, ax: Axes | Figure | None) -> Figure:
