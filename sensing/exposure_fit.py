@@ -18,7 +18,6 @@ from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ..models.parameters.tolerances import Tolerance
 from ..models.telescope import Telescope
 from ..wavefront.atmosphere.atmosphere import Atmosphere
-from .air_shape import air_shape
 from .degrees import FreedomEstimate, prior_spreads
 from .exposure import ExposureWavefront
 from .fit_star import StarFit
@@ -28,9 +27,9 @@ from .inputs import noll_indices, small_length
 from .light import Instrument
 from .moving_rims import FreeRims
 from .shared_rims import shared_rims
-from .sided_stars import FIELD_NOLL, SAME_STAR, air_of_zernikes, field_basis, relative_outer_scale, sided_stars
+from .sided_stars import FIELD_NOLL, SAME_STAR, field_basis, sided_stars
 from .sides import SideAgreement, pair_agreement
-from .star_errors import StarErrors, star_errors
+from .star_errors import StarErrors, air_of, air_of_zernikes, star_errors
 from .star_fitter import StarSolution
 from .terms import WavefrontTerms
 from .wavefront_fits import NOLL, FittedStar, FittedStars, UsableStars, WavefrontFit
@@ -119,10 +118,10 @@ class ExposureDonuts(WavefrontFit):
         exposure, known = fitted.exposure, instrument.model.air.atmosphere is not None
         if known or exposure is None or exposure.air_rms < _SLIGHT_AIR:
             return None
-        terms, telescope = instrument.terms, instrument.telescope
+        terms = instrument.terms
         noll = np.arange(4, max(_AIR_TERMS, int(terms.every.max())) + 1)
         further = np.concatenate([terms.further, np.setdiff1d(noll, terms.every)])
-        variance = np.diag(air_shape(int(noll[-1]), telescope.pupil_obscuration, relative_outer_scale(instrument)))
+        variance = np.diag(air_of(instrument, int(noll[-1])))
         variance = min(exposure.air_rms, _MOST_AIR) ** 2 * variance[further - 4]
         variance[: len(terms.further)] += 1.0 / terms.precision[len(terms.requested) :]
         precision = np.concatenate([np.zeros(len(terms.requested)), 1.0 / variance])

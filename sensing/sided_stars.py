@@ -9,12 +9,12 @@ import numpy as np
 
 from ..core.units import radians
 from ..models.zernike_polynomials import annular_zernikes, noll_to_nm
-from .air_shape import air_shape
 from .fit_star import StarFit
 from .flags import DonutFlag
 from .hierarchy import Basis, Observations, fit_hierarchy, star_numbers
 from .light import Instrument
 from .sides import SideFit, decide_sides
+from .star_errors import air_of_zernikes
 
 #: Terms over the field: up to the second degree.
 FIELD_NOLL = tuple(range(1, 7))
@@ -75,15 +75,3 @@ def field_basis(instrument: Instrument, fields: np.ndarray, field_noll: Iterable
     columns = np.einsum("ik,ab->iakb", over_field, np.eye(len(noll))).reshape(len(fields), len(noll), -1)
     field_degree, pupil_degree = (np.array([noll_to_nm(int(j))[0] for j in js]) for js in (over, noll))
     return Basis(columns, np.repeat(field_degree, len(noll)), np.tile(pupil_degree, len(over)))
-
-
-def air_of_zernikes(instrument: Instrument) -> np.ndarray:
-    """Return the covariance of the air's terms over that of Z4 to Z22 together, shape [n_noll, n_noll]."""
-    noll, telescope = instrument.terms.requested, instrument.telescope
-    shape = air_shape(max(22, int(noll.max())), telescope.pupil_obscuration, relative_outer_scale(instrument))
-    return shape[np.ix_(noll - 4, noll - 4)]
-
-
-def relative_outer_scale(instrument: Instrument) -> float:
-    """Return the outer scale of the turbulence over the radius of the pupil."""
-    return float(instrument.model.air.outer_scale) / (0.5 * instrument.telescope.pupil_diameter)

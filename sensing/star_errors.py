@@ -181,12 +181,17 @@ def model_floor(zernikes: np.ndarray) -> np.ndarray:
 
 def air_of_terms(instrument: Instrument) -> np.ndarray:
     """Return the covariance of the terms asked for in the mean wavefront of an exposure, of unit trace, [n, n]."""
-    low = instrument.terms.requested - 4
-    covariance = _air_of(instrument, max(_AIR_TERMS, int(instrument.terms.requested.max())))[np.ix_(low, low)]
+    covariance = air_of_zernikes(instrument)
     return np.asarray(covariance / np.trace(covariance))
 
 
-def _air_of(instrument: Instrument, last: int) -> np.ndarray:
+def air_of_zernikes(instrument: Instrument) -> np.ndarray:
+    """Return the same over the variance of Z4 to Z22 together, shape [n, n]."""
+    low = instrument.terms.requested - 4
+    return air_of(instrument, max(_AIR_TERMS, int(instrument.terms.requested.max())))[np.ix_(low, low)]
+
+
+def air_of(instrument: Instrument, last: int) -> np.ndarray:
     """Return the covariance of Z4 to a last term in the mean wavefront of an exposure, of unit trace up to Z22."""
     telescope = instrument.telescope
     outer_scale = float(instrument.model.air.outer_scale) / (0.5 * telescope.pupil_diameter)
@@ -210,7 +215,7 @@ class _TermsBeside:
     def _shape(self) -> np.ndarray:
         """Covariance of Z4 to the last term by air of unit size [m^2]."""
         last = max(_AIR_TERMS, int(self._instrument.terms.every.max()))
-        return _UNIT**2 * _air_of(self._instrument, last)
+        return _UNIT**2 * air_of(self._instrument, last)
 
     @cached_property
     def _high(self) -> np.ndarray:
