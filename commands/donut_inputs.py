@@ -108,9 +108,11 @@ class StampFiles:
         for option, plane in (("--mask", mask), ("--variance", variance)):
             if plane is not None and len(paths) > 1:
                 raise ConfigError(f"{option} = {plane} for {len(paths)} files: expected one file of stamps with it")
+        resolved: set[Path] = set()
         for path in paths:
-            if sum(path.resolve() == other.resolve() for other in paths) > 1:
+            if path.resolve() in resolved:
                 raise ConfigError("given twice: its donuts would count as two exposures", file=path)
+            resolved.add(path.resolve())
         return cls(paths, [read_stamps(path, positions, size, mask=mask, variance=variance) for path in paths])
 
     def header(self) -> HeaderValues:
