@@ -99,21 +99,21 @@ def cross_checked(
     )
     # All of them have looked through one air, of which the residuals of one donut say little.
     common = np.mean([parts[i].air for i in group], axis=0)
-    told = float(np.trace(common))
-    lacking = residuals + freedom * told
+    residual_air = float(np.trace(common))
+    lacking = residuals + freedom * residual_air
     # Donuts near each other look through one air: what they differ by may be anything else.
     near = bool((np.hypot(*(fields[group] - fields[group].mean(axis=0)).T) < _NEAR).all())
-    middle = told if near else max(told, _LEAST_AIR**2)
+    middle = residual_air if near else max(residual_air, _LEAST_AIR**2)
     if measured_air and middle > 0.0 and scatter < most + noise + lacking:
         # What donuts share of the air is no part of the scatter.
-        own = _AIR_OF_ITS_OWN * freedom
-        variance = _air_variance(scatter, noise + residuals, own, middle, _INDEPENDENT * freedom)
-        of_air = min(variance / told, 1.0) * common if told > 0.0 else common
-        of_air = of_air + max(variance - told, 0.0) * air()
+        unshared = _AIR_OF_ITS_OWN * freedom
+        variance = _air_variance(scatter, noise + residuals, unshared, middle, _INDEPENDENT * freedom)
+        of_air = min(variance / residual_air, 1.0) * common if residual_air > 0.0 else common
+        of_air = of_air + max(variance - residual_air, 0.0) * air()
         for i in group:
             errors = parts[i]
             checked[i] = ErrorParts.of(errors.photons, errors.residuals, of_air, errors.floor)
-        lacking = residuals + own * variance
+        lacking = residuals + unshared * variance
     excess = scatter - noise - lacking
     if excess > most:
         return list(parts)
@@ -128,15 +128,15 @@ def cross_checked(
     return checked
 
 
-def _air_variance(scatter: float, others: float, own: float, middle: float, freedom: float) -> float:
+def _air_variance(scatter: float, others: float, unshared: float, middle: float, freedom: float) -> float:
     """Return the likeliest variance of the air's wavefront by the scatter of the donuts.
 
-    The scatter has so many degrees of freedom; it is expected to be what all else makes, and the variance times `own`.
-    The prior lies about the variance `middle`.
+    The scatter has so many degrees of freedom; it is expected to be what all else makes, and the variance times
+    `unshared`. The prior lies about the variance `middle`.
     """
 
     def loss(logarithm: float) -> float:
-        expected = others + math.exp(logarithm) * middle * own
+        expected = others + math.exp(logarithm) * middle * unshared
         prior = 0.5 * (logarithm / _AIR_SPREAD) ** 2
         return prior + 0.5 * freedom * (math.log(expected) + scatter / expected)
 
