@@ -34,7 +34,7 @@ from .shared_rims import (
     moved_rims_of_all,
     shared_rims,
 )
-from .solve import solve
+from .solve import DAMPING, solve
 from .star_fitter import StarSolution
 from .vignetting import cells_with_rims, rim_shifts
 from .wavefront_fits import NOLL, FittedStars, UsableStars, WavefrontFit, joint_results
@@ -104,7 +104,7 @@ class TelescopeFreedoms(WavefrontFit):
         shared = np.append(shared, 0.0 * slopes)
 
         def fitted(rims: FreeRims) -> JointFit:
-            at, of_stars = shared, unknowns
+            at, of_stars, damping = shared, unknowns, DAMPING
             for _ in range(_OUTER):
                 stars = [
                     self._with_vignetting(instrument, star, rims, at[:count], star_shifts @ at[:count])
@@ -112,9 +112,10 @@ class TelescopeFreedoms(WavefrontFit):
                 ]
                 group = group_with_rims(instrument, stars, maps, precision, rims, transient=True)
                 start = np.concatenate([at, np.zeros(len(rims))])
-                solution = solve(group, of_stars, start, steps=_INNER, pool=pool)
+                solution = solve(group, of_stars, start, steps=_INNER, damping=damping, pool=pool)
                 joint = JointFit(stars, group, solution, rims)
                 change, at, of_stars = solution.shared - start, solution.shared[:first], list(solution.stars)
+                damping = solution.damping
                 if float(change @ np.linalg.solve(solution.shared_covariance, change)) < _SETTLED * len(change):
                     break
                 rims = rims.moved(change[first:])

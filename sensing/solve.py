@@ -26,7 +26,7 @@ _NEAR = 1.0
 #: lacks much, its derivatives are not good enough for the last hundredth, and errors have what is left.
 _EXPLAINED = 1e-2
 #: Damping of the first step, in units of the curvature.
-_DAMPING = 1e-3
+DAMPING = 1e-3
 #: Damping after a step whose gain is as predicted, over that before: where derivatives are not exact, that of the last
 #: step is nearly what the next one needs.
 _LESS = 1.0 / 3.0
@@ -97,6 +97,8 @@ class Solution:
         Twice the negative logarithm of likelihood and prior.
     converged : bool
         Whether the last step was small enough.
+    damping : float
+        Damping of the first step of a search that goes on from here.
     """
 
     stars: tuple[np.ndarray, ...]
@@ -106,6 +108,7 @@ class Solution:
     chi2: np.ndarray
     loss: float
     converged: bool
+    damping: float = DAMPING
 
     def star_covariance(self, star: int) -> np.ndarray:
         """Return the covariance of the unknowns of one star."""
@@ -128,10 +131,13 @@ def solve(
     tolerance: float = FINE,
     steps: int = STEPS,
     hopeless: float = np.inf,
+    damping: float = DAMPING,
     pool: Executor | None = None,
 ) -> Solution:
     """Maximise the likelihood from a starting point, by so many steps or until one is to gain less than a tolerance.
 
+    A search that goes on where another ended starts with its damping: along what the stars hardly tell, no step gets
+    anywhere with more.
     A start without a likelihood is returned as it is, with an infinite loss. A search that after its first step
     predicts no loss below a `hopeless` one ends there, with the loss that it predicts.
     """
@@ -140,7 +146,7 @@ def solve(
     pixels = sum(int(stamp.used.sum()) for stamp in group.stamps)
     held = _held(group, sizes)
     state = _linearize(group, joined, sizes, pool)
-    damping, converged, predicted = _DAMPING, False, np.inf
+    converged, predicted = False, np.inf
     for count in range(steps if np.isfinite(state.loss) else 0):
         step = np.zeros_like(joined)
         free = ~held & ~_pressed(group, joined, state.gradient, sizes)
@@ -164,7 +170,7 @@ def solve(
             damping *= max(_LESS, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
             joined, state = trial, trial_state
         else:
-            damping = 10.0 * max(damping, _DAMPING)
+            damping = 10.0 * max(damping, DAMPING)
             if damping > _LARGEST_DAMPING or predicted < _worth(state.loss, pixels):
                 break
     converged = converged or predicted < max(_NEAR, _NEAR * state.loss / pixels, _worth(state.loss, pixels))
@@ -177,7 +183,7 @@ def solve(
     star_unknowns = tuple(joined[a:b] for a, b in itertools.pairwise(bounds))
     best = joined[bounds[-1] :]
     waves = tuple(m @ best for m in group.maps)
-    return Solution(star_unknowns, best, waves, covariance, state.chi2, state.loss, converged)
+    return Solution(star_unknowns, best, waves, covariance, state.chi2, state.loss, converged, min(damping, DAMPING))
 
 
 def _worth(loss: float, pixels: int) -> float:

@@ -38,7 +38,7 @@ from .shared_rims import (
     with_shared_rims,
 )
 from .sided_stars import sided_stars
-from .solve import Solution, solve
+from .solve import DAMPING, Solution, solve
 from .star_errors import ErrorParts, model_floor, star_errors, with_errors
 from .star_fitter import StarSolution
 from .terms import WavefrontTerms
@@ -276,13 +276,14 @@ class FieldTerms(WavefrontFit):
         precision, first = np.append(precision, slopes**-2.0), len(shared)
 
         def fitted(rims: FreeRims) -> JointFit:
-            at, of_stars = shared, unknowns
+            at, of_stars, damping = shared, unknowns, DAMPING
             for _ in range(RIM_STEPS):
                 stars = [with_shared_rims(instrument, star, rims) for star in usable.stars]
                 group = group_with_rims(instrument, stars, maps, precision, rims)
-                solution = solve(group, of_stars, np.concatenate([at, np.zeros(len(rims))]), pool=pool)
+                start = np.concatenate([at, np.zeros(len(rims))])
+                solution = solve(group, of_stars, start, damping=damping, pool=pool)
                 joint = JointFit(stars, group, solution, rims)
-                at, of_stars = solution.shared[:first], list(solution.stars)
+                at, of_stars, damping = solution.shared[:first], list(solution.stars), solution.damping
                 if settled(rims, solution.shared[first:]):
                     break
                 rims = rims.moved(solution.shared[first:])

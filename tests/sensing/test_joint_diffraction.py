@@ -42,7 +42,8 @@ def test_joint_fits_find_a_misaligned_telescope(focused):
     )
     assert np.linalg.norm(after - before, axis=1).min() > 200e-9
     error = np.linalg.norm(fit.zernikes[: len(FIELDS)] - (after - before), axis=1)
-    assert error.max() < 4e-9
+    # Steps that were damped anew with every outer iteration left 4 nm.
+    assert error.max() < 2e-9
     assert fit.chi2.max() < 1e-3 * fit.n_pixels.min()
 
 
