@@ -149,14 +149,14 @@ def donuts_command(
         ),
     ] = None,
     site: Annotated[
-        str,
+        str | None,
         names(
             completion.sites,
             metavar="SITE|FILE",
-            help="Site whose turbulence and winds --exposure-s is about.",
+            help="Site of turbulence and winds; that of the telescope by default, else cerro_pachon.",
             rich_help_panel=_FIT,
         ),
-    ] = "cerro_pachon",
+    ] = None,
     degrees_of_freedom: Annotated[
         str | None,
         names(
@@ -360,7 +360,9 @@ def donuts_command(
         raise ProductError(text, file=files[0], key=TELESCOPE_KEY) from None
     believed = frames.telescope(focused)
     noll = range(4, terms + 1)
-    atmosphere = None if exposure_s is None else Atmosphere.from_site(site, 0, exposure=exposure_s)
+    air = DonutAir(outer_scale=outer_scale_m, site=site)
+    if exposure_s is not None:
+        air = replace(air, atmosphere=Atmosphere.from_site(air.layers(believed), 0, exposure=exposure_s))
     inputs = donut_inputs(files_read, options, frames, believed, _electrons(gain, header))
     higher_order = higher_order_nm * 1e-9
     wavefront: WavefrontFit = ExposureDonuts(noll=noll, higher_order=higher_order)
@@ -369,7 +371,7 @@ def donuts_command(
     elif each_alone or len(inputs.images) < 2:
         wavefront = SingleDonuts(noll, higher_order=higher_order)
     model = DonutModel(
-        air=DonutAir(outer_scale=outer_scale_m, atmosphere=atmosphere),
+        air=air,
         detector=DonutDetector(
             _pixel_um(pixel_um, header.pixel, header.camera) * 1e-6,
             defocus=inputs.defocus + inputs.heights + 1e-6 * defocus_um,

@@ -10,7 +10,6 @@ from functools import partial
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from .hierarchy import GROUND
 from .light import Instrument
 from .star_errors import ErrorParts, air_of_terms, star_errors
 from .star_fitter import StarSolution
@@ -25,8 +24,6 @@ _NEAR = 0.1
 _MOST_SCATTER = 150e-9
 #: Part of unexplained scatter that is where the donuts differ, beside that of the air: it may have another cause.
 _WHERE_SEEN = 0.5
-#: Fraction of the air's variance that stars do not share.
-_AIR_OF_ITS_OWN = 1.0 - GROUND
 #: Least rms of the air's wavefront about which its prior lies, whatever the residuals say [m].
 _LEAST_AIR = 20e-9
 #: Standard deviation of the logarithm of its variance.
@@ -49,7 +46,7 @@ def checked_parts(instrument: Instrument, stars: Sequence[StarSolution], fields:
         [star_errors(instrument, star).parts for star in stars],
         np.array([star.light.depth > 0.0 for star in stars], dtype=bool),
         partial(air_of_terms, instrument),
-        measured_air=instrument.model.air.atmosphere is None,
+        None if instrument.model.air.atmosphere is not None else instrument.shared_air,
     )
 
 
@@ -59,7 +56,7 @@ def cross_checked(
     parts: Sequence[ErrorParts],
     behind: np.ndarray,
     air: Callable[[], np.ndarray],
-    measured_air: bool,
+    shared: float | None,
 ) -> list[ErrorParts]:
     """Return the errors of donuts that are fitted each by itself, after a check against their scatter.
 
@@ -78,8 +75,8 @@ def cross_checked(
         Whether the detector is behind focus.
     air : callable
         Covariance of unit trace that unexplained scatter has, [n_noll, n_noll].
-    measured_air : bool
-        Whether the air's part is measured from the residuals, not known by the exposure.
+    shared : float, optional
+        Part of the air's variance that they share, which is measured from the residuals; None if the exposure is known.
     """
     checked = list(parts)
     group, design = _smooth_field(fields)
@@ -104,9 +101,9 @@ def cross_checked(
     # Donuts near each other look through one air: what they differ by may be anything else.
     near = bool((np.hypot(*(fields[group] - fields[group].mean(axis=0)).T) < _NEAR).all())
     middle = residual_air if near else max(residual_air, _LEAST_AIR**2)
-    if measured_air and middle > 0.0 and scatter < most + noise + lacking:
+    if shared is not None and middle > 0.0 and scatter < most + noise + lacking:
         # What donuts share of the air is no part of the scatter.
-        unshared = _AIR_OF_ITS_OWN * freedom
+        unshared = (1.0 - shared) * freedom
         variance = _air_variance(scatter, noise + residuals, unshared, middle, _INDEPENDENT * freedom)
         of_air = min(variance / residual_air, 1.0) * common if residual_air > 0.0 else common
         of_air = of_air + max(variance - residual_air, 0.0) * air()
@@ -123,7 +120,7 @@ def cross_checked(
     share = min(max(scatter - noise, 0.0) / lacking, 1.0) if lacking > 0.0 else 1.0
     for i in group:
         errors = checked[i]
-        own = _lacking(errors) - (1.0 - _AIR_OF_ITS_OWN) * errors.air if measured_air else _lacking(errors)
+        own = _lacking(errors) - (shared or 0.0) * errors.air
         checked[i] = replace(errors, repeats=_noise(errors) + share * own)
     return checked
 

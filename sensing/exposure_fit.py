@@ -21,7 +21,7 @@ from ..wavefront.atmosphere.atmosphere import Atmosphere
 from .degrees import FreedomEstimate, prior_spreads
 from .exposure import ExposureWavefront
 from .fit_star import StarFit
-from .hierarchy import Basis, Hierarchy, Observations, fit_hierarchy, star_numbers
+from .hierarchy import Basis, ExposureAir, Hierarchy, Observations, fit_hierarchy, star_numbers
 from .image_model import STRENGTH
 from .inputs import noll_indices, small_length
 from .light import Instrument
@@ -29,7 +29,7 @@ from .moving_rims import FreeRims
 from .shared_rims import shared_rims
 from .sided_stars import FIELD_NOLL, SAME_STAR, field_basis, sided_stars
 from .sides import SideAgreement, pair_agreement
-from .star_errors import StarErrors, air_of, air_of_zernikes, star_errors
+from .star_errors import StarErrors, air_of, exposure_air, star_errors
 from .star_fitter import StarSolution
 from .terms import WavefrontTerms
 from .wavefront_fits import NOLL, FittedStar, FittedStars, UsableStars, WavefrontFit
@@ -146,29 +146,28 @@ class ExposureDonuts(WavefrontFit):
         star = self._stars(usable.every_field)[usable.index]
         paired = [len(set(behind[star == number])) > 1 for number in np.unique(star)]
         exposure = behind.astype(np.int64) if any(paired) else np.zeros(count, dtype=np.int64)
-        observations, shape = Observations(zernikes, covariance, star, exposure), air_of_zernikes(instrument)
-        air = (
-            1e-12 if instrument.known_seeing and not any(s.solution.stars[0][STRENGTH] for s in usable.stars) else None
-        )
+        observations = Observations(zernikes, covariance, star, exposure)
+        no_air = instrument.known_seeing and not any(s.solution.stars[0][STRENGTH] for s in usable.stars)
+        air = exposure_air(instrument, 1e-12 if no_air else None)
         freedoms = None
         double: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
         if self.freedoms is None:
             basis = field_basis(instrument, usable.fields, self.field_noll)
-            hierarchy = fit_hierarchy(observations, basis, shape, air)
+            hierarchy = fit_hierarchy(observations, basis, air)
             double = hierarchy.terms.reshape(-1, n), hierarchy.term_covariance
         else:
-            hierarchy, basis, freedoms = self._freedoms(usable, observations, shape, air)
+            hierarchy, basis, freedoms = self._freedoms(usable, observations, air)
         sides = None
         if behind.any() and not behind.all():
             sizes = hierarchy.sizes
-            sides = pair_agreement(zernikes, covariance, star, behind, sizes.noise, sizes.air**2 * shape)
-            sides = sides or _sides_apart(observations, basis, shape, air, behind)
+            sides = pair_agreement(zernikes, covariance, star, behind, sizes.noise, sizes.air**2 * air.shape)
+            sides = sides or _sides_apart(observations, basis, air, behind)
         exposure_result = ExposureWavefront(
             instrument.terms.requested,
             hierarchy.total,
             hierarchy.total_covariance + figure,
             hierarchy.total - hierarchy.telescope,
-            0.0 if air is not None else hierarchy.sizes.air,
+            0.0 if no_air else hierarchy.sizes.air,
             hierarchy.sizes.noise,
             sides,
             _notices(hierarchy, sides),
@@ -209,7 +208,7 @@ class ExposureDonuts(WavefrontFit):
             believed = coefficients if believed is None else believed
             made = (coefficients - believed)[:, noll - 1] - columns @ (values / spreads)
             basis = Basis(columns, variance=np.ones(len(spreads)))
-            hierarchy = fit_hierarchy(replace(observations, zernikes=observations.zernikes - made), basis, shape, air)
+            hierarchy = fit_hierarchy(replace(observations, zernikes=observations.zernikes - made), basis, air)
             values = hierarchy.terms * spreads
         hierarchy = replace(hierarchy, telescope=hierarchy.telescope + made, total=hierarchy.total + made)
         covariance = hierarchy.term_covariance * np.outer(spreads, spreads)
@@ -228,9 +227,7 @@ def _results(
     ]
 
 
-def _sides_apart(
-    observations: Observations, basis: Basis, shape: np.ndarray, air: float | None, behind: np.ndarray
-) -> SideAgreement:
+def _sides_apart(observations: Observations, basis: Basis, air: ExposureAir, behind: np.ndarray) -> SideAgreement:
     """Return the agreement of donuts of different stars on both sides, by a step between them beside the basis."""
     n = observations.zernikes.shape[1]
     step = np.where(behind, 0.5, -0.5)[:, None, None] * np.eye(n)
@@ -242,7 +239,7 @@ def _sides_apart(
         assert basis.pupil_degree is not None
         field_degree = np.concatenate([basis.field_degree, np.zeros(n, dtype=np.int64)])
         wider = Basis(columns, field_degree, np.concatenate([basis.pupil_degree, basis.pupil_degree[:n]]))
-    hierarchy = fit_hierarchy(observations, wider, shape, air)
+    hierarchy = fit_hierarchy(observations, wider, air)
     difference, spread = hierarchy.terms[-n:], hierarchy.term_covariance[-n:, -n:]
     chi2 = float(difference @ np.linalg.solve(spread, difference)) / n
     return SideAgreement(0, float(np.linalg.norm(difference)), np.nan, chi2)

@@ -21,10 +21,6 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
-#: Part of the air's variance that all donuts of an exposure share, in layers near the ground. By weights over speeds it
-#: is 0.8 at Cerro Pachon, and anything from 0.2 to 0.9 elsewhere: as much as gives the mean of the whole variance over
-#: their own.
-GROUND = 0.66
 #: Rms of the air's wavefront about which its prior lies, that of 15 s under median seeing, Z4 to Z22 [m].
 AIR_RMS = 110e-9
 #: Largest air that can be told from wavefronts that have nothing in common [m].
@@ -74,6 +70,25 @@ class Observations:
     def repeated(self) -> bool:
         """Whether a star has several donuts."""
         return len(np.unique(self.star)) < len(self.star)
+
+
+@dataclass(frozen=True)
+class ExposureAir:
+    """The air's mean wavefront in an exposure.
+
+    Attributes
+    ----------
+    shape : ndarray, shape [n_noll, n_noll]
+        Covariance of its terms over that of Z4 to Z22 together.
+    shared : float
+        Part of it that all donuts of the exposure share.
+    rms : float, optional
+        Rms, Z4 to Z22 [m]; fitted by default.
+    """
+
+    shape: np.ndarray
+    shared: float
+    rms: float | None = None
 
 
 @dataclass(frozen=True)
@@ -167,7 +182,7 @@ class Hierarchy:
     total_covariance: np.ndarray
 
 
-def fit_hierarchy(observations: Observations, basis: Basis, shape: np.ndarray, air: float | None = None) -> Hierarchy:
+def fit_hierarchy(observations: Observations, basis: Basis, air: ExposureAir) -> Hierarchy:
     """Return the wavefronts of telescope and air that are most likely.
 
     Parameters
@@ -176,16 +191,14 @@ def fit_hierarchy(observations: Observations, basis: Basis, shape: np.ndarray, a
         Fitted wavefronts.
     basis : Basis
         Terms of the telescope's wavefront.
-    shape : ndarray, shape [n_noll, n_noll]
-        Covariance of the air's terms over that of Z4 to Z22 together.
-    air : float, optional
-        Rms of the air's wavefront, Z4 to Z22 [m]; fitted by default.
+    air : ExposureAir
+        The air's mean wavefront.
     """
-    model = _Model(observations, basis, shape)
+    model = _Model(observations, basis, air)
     of_field = basis.variance is None
-    free = [True, air is None, of_field, of_field, of_field, observations.repeated]
+    free = [True, air.rms is None, of_field, of_field, of_field, observations.repeated]
     local = _LOCAL_RMS if observations.repeated else 1e-3 * _UNIT
-    middle = np.log([1.0, air or AIR_RMS, _LINEAR_RMS, math.log(_FALL), _BENT_RMS, local])
+    middle = np.log([1.0, air.rms or AIR_RMS, _LINEAR_RMS, math.log(_FALL), _BENT_RMS, local])
     # Standard deviations of the logarithms of rms are half of those of variances.
     spread = np.array([_SCALE_SPREAD, 0.5 * _WIDE, 0.5 * _WIDE, _FALL_SPREAD, 0.5 * _WIDE, 0.5 * _WIDE])
     least, most = middle - 4.0 * spread, middle + 4.0 * spread
@@ -210,8 +223,9 @@ def fit_hierarchy(observations: Observations, basis: Basis, shape: np.ndarray, a
 class _Model:
     """Gaussian algebra of observations, in nanometres."""
 
-    def __init__(self, observations: Observations, basis: Basis, shape: np.ndarray) -> None:
-        self._basis, self._shape = basis, shape
+    def __init__(self, observations: Observations, basis: Basis, air: ExposureAir) -> None:
+        self._basis, self._shape = basis, air.shape
+        self._shared = air.shared
         self._count, self._n = observations.zernikes.shape
         self._values = observations.zernikes / _UNIT
         self._noise = observations.covariance / _UNIT**2
@@ -229,7 +243,7 @@ class _Model:
         """Return the covariances of the wavefronts of stars but for the terms, [n_star, size n_noll, size n_noll]."""
         n_star, size = group.shape
         blocks = np.zeros((n_star, size, self._n, size, self._n))
-        above = (1.0 - GROUND) * (sizes.air / _UNIT) ** 2 * self._shape
+        above = (1.0 - self._shared) * (sizes.air / _UNIT) ** 2 * self._shape
         for k in range(size):
             blocks[:, k, :, k, :] = sizes.noise * self._noise[group[:, k]] + above
         blocks += self._local(sizes)[None, None, :, None, :]
@@ -245,7 +259,7 @@ class _Model:
         Degrees of freedom have units of their own; terms over the field are in metres.
         """
         variance = self._basis.variances(sizes)
-        ground = GROUND * (sizes.air / _UNIT) ** 2 * self._shape
+        ground = self._shared * (sizes.air / _UNIT) ** 2 * self._shape
         ground = ground + 1e-12 * np.trace(ground) * np.eye(self._n)
         precision = np.diag(np.concatenate([1.0 / variance, np.zeros(self._n_shared)]))
         first, logarithm = len(variance), float(np.log(variance).sum())
@@ -297,7 +311,7 @@ class _Model:
         total = np.zeros_like(self._values)
         total_covariance = np.zeros_like(self._noise)
         local = self._local(sizes)
-        above = (1.0 - GROUND) * (sizes.air / _UNIT) ** 2 * self._shape
+        above = (1.0 - self._shared) * (sizes.air / _UNIT) ** 2 * self._shape
         for group, inverse in zip(self._groups, inverses, strict=True):
             n_star, size = group.shape
             design = self._design[group].reshape(n_star, size * self._n, -1)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .cross_check import checked_parts
-from .hierarchy import GROUND
 from .light import Instrument
 from .likelihood import linearized
 from .residual_power import residual_power
@@ -77,12 +76,12 @@ def joint_errors(
             donuts.append(i)
     air, figure = np.zeros((2, unknowns, unknowns))
     if errors:
-        common = np.sum(gains, axis=0)
+        common, shared = np.sum(gains, axis=0), instrument.shared_air
         # Residuals of one star say little of the air that all have, and their scatter more.
         checked = checked_parts(instrument, [alone[i] for i in donuts], fields[donuts])
         of_air = np.mean([parts.air for parts in checked], axis=0)
         own = np.sum([gain @ of_air @ gain.T for gain in gains], axis=0)
-        air = GROUND * common @ of_air @ common.T + (1.0 - GROUND) * own
+        air = shared * common @ of_air @ common.T + (1.0 - shared) * own
         figure = common @ np.mean([star_error.figure for star_error in errors], axis=0) @ common.T
     return JointErrors(_by_residuals(instrument, stars, group, solution), air, figure)
 

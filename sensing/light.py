@@ -25,6 +25,7 @@ from .pupil_cells import PupilCells
 from .response_slope import cells_with_response
 from .rim_outlines import concentric
 from .seeing import Seeing
+from .shared_air import shared_air
 from .stamps import Pixels
 from .terms import WavefrontTerms
 from .vignetting import MovableRim, cells_with_rims, movable_rims, shift_spread
@@ -135,6 +136,11 @@ class Instrument:
     def known_seeing(self) -> bool:
         """Whether the strengths of the turbulence are held."""
         return self.model.air.fwhm is not None
+
+    @property
+    def shared_air(self) -> float:
+        """Part of the variance of the air's mean wavefront that donuts of an exposure share."""
+        return shared_air(self.telescope, self.model.air.layers(self.telescope))
 
     @property
     def slope_spreads(self) -> np.ndarray:

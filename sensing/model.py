@@ -11,13 +11,15 @@ from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError, UnknownNameError, shown
 from ..core.units import ARCSEC, angle, metres, radians, require_count, require_positive, require_within
 from ..models.camera.focal_plane import FocalPlane
+from ..models.io.site_file import load_site
+from ..models.site import Site
 from ..models.telescope import Telescope
 from ..wavefront.atmosphere.atmosphere import Atmosphere
 from ..wavefront.psf.light import Light
 from .inputs import one_for_each, outer_scale_of, small_length
 from .seeing import Seeing
 
-#: Site of an exposure of known seeing; of its layers the mean image depends on nothing but that.
+#: Site of telescopes that state none; of its layers a mean image depends on nothing but the seeing.
 _SITE = "cerro_pachon"
 #: Seeing that a search starts from [rad].
 _START_FWHM = 0.8 * ARCSEC
@@ -55,22 +57,34 @@ class DonutAir:
         asked for are fitted too, with the prior of the closed form, and not returned; its own of the terms asked for,
         which no single donut tells from the telescope's, are added to ``covariance``. Three times the time; no joint
         fits.
+    site : str or Site, optional
+        Site whose layers and winds say which part of the air all donuts of an exposure of unknown length share; that of
+        the telescope by default, else ``"cerro_pachon"``.
 
     Raises
     ------
     DomainError
         If a number is outside its range.
+    UnknownNameError
+        If there is no such site.
     """
 
     fwhm: ArrayLike | None = None
     outer_scale: float = 25.0
     atmosphere: Atmosphere | None = None
+    site: str | Site | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.site, str):
+            object.__setattr__(self, "site", load_site(self.site))
         outer_scale_of(self.outer_scale)
         widths = np.zeros(1) if self.fwhm is None else radians(self.fwhm, "fwhm")
         if not ((widths >= 0.0) & (widths < _MOST_FWHM)).all():
             raise DomainError(f"fwhm = {shown(self.fwhm)}: expected angles from 0 to {_MOST_FWHM:g} rad")
+
+    def layers(self, telescope: Telescope) -> Site:
+        """Return the site, or that of a telescope."""
+        return self.site if isinstance(self.site, Site) else load_site(telescope.site or _SITE)
 
     def seeing(self, wavelength: float) -> Seeing:
         """Return the long exposure at a wavelength [m]."""

@@ -14,7 +14,7 @@ from .flags import DonutFlag
 from .hierarchy import Basis, Observations, fit_hierarchy, star_numbers
 from .light import Instrument
 from .sides import SideFit, decide_sides
-from .star_errors import air_of_zernikes
+from .star_errors import exposure_air
 
 #: Terms over the field: up to the second degree.
 FIELD_NOLL = tuple(range(1, 7))
@@ -55,7 +55,7 @@ def sided_stars(
             np.zeros(len(star), dtype=np.int64),
         )
         basis = field_basis(instrument, fields[index], field_noll)
-        return fit_hierarchy(observations, basis, air_of_zernikes(instrument)).loss
+        return fit_hierarchy(observations, basis, exposure_air(instrument)).loss
 
     decision = decide_sides([star.sides for star in stars], smoothness)
     changed = []

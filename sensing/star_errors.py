@@ -12,6 +12,7 @@ from scipy.linalg import solve_triangular
 from ..wavefront.atmosphere.turbulence import REFERENCE_WAVELENGTH
 from .air_shape import air_shape
 from .donut_rays import ZernikeRays
+from .hierarchy import ExposureAir
 from .image_model import STRENGTH
 from .light import Instrument
 from .likelihood import Linearized, linearized, wavefront_columns
@@ -189,6 +190,11 @@ def air_of_zernikes(instrument: Instrument) -> np.ndarray:
     """Return the same over the variance of Z4 to Z22 together, shape [n, n]."""
     low = instrument.terms.requested - 4
     return air_of(instrument, max(_AIR_TERMS, int(instrument.terms.requested.max())))[np.ix_(low, low)]
+
+
+def exposure_air(instrument: Instrument, rms: float | None = None) -> ExposureAir:
+    """Return the mean wavefront of an exposure, of an rms of Z4 to Z22 [m] if it is known."""
+    return ExposureAir(air_of_zernikes(instrument), instrument.shared_air, rms)
 
 
 def air_of(instrument: Instrument, last: int) -> np.ndarray:

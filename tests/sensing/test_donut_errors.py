@@ -14,7 +14,6 @@ from pachon.models.aperture import Circle
 from pachon.models.zernike_polynomials import noll_to_nm
 from pachon.sensing.air_shape import air_shape
 from pachon.sensing.cross_check import cross_checked
-from pachon.sensing.hierarchy import GROUND
 from pachon.sensing.likelihood import Linearized
 from pachon.sensing.noise import measured_noise
 from pachon.sensing.residual_power import residual_power
@@ -29,6 +28,8 @@ BLUR = pachon.DonutModel(
 )
 OPTIONS = {"model": BLUR, "threads": 1}
 SKY = 500.0
+#: Part of the air that donuts share.
+GROUND = 0.66
 
 
 def hill(size=80):
@@ -188,16 +189,14 @@ def test_scatter_of_donuts_beyond_their_errors_is_air_of_which_they_share_a_part
     scatter = rng.normal(0.0, 80e-9 / np.sqrt(19), (30, 19))
     one_side = np.ones(30, dtype=bool)
     checked = cross_checked(
-        fields, smooth + scatter, [parts_of(20e-9)] * 30, one_side, lambda: np.eye(19) / 19, measured_air=True
+        fields, smooth + scatter, [parts_of(20e-9)] * 30, one_side, lambda: np.eye(19) / 19, shared=GROUND
     )
     assert np.sqrt(np.trace(checked[0].repeats)) == pytest.approx(80e-9, rel=0.1)
     air = (80e-9**2 - 20e-9**2) / (1.0 - GROUND)
     assert np.sqrt(np.trace(checked[0].total)) == pytest.approx(np.sqrt(20e-9**2 + air), rel=0.1)
     # Too different to be of one exposure of one telescope.
     unrelated = rng.normal(0.0, 300e-9 / np.sqrt(19), (30, 19))
-    apart = cross_checked(
-        fields, unrelated, [parts_of(20e-9)] * 30, one_side, lambda: np.eye(19) / 19, measured_air=True
-    )
+    apart = cross_checked(fields, unrelated, [parts_of(20e-9)] * 30, one_side, lambda: np.eye(19) / 19, shared=GROUND)
     assert np.sqrt(np.trace(apart[0].total)) == pytest.approx(20e-9)
 
 
@@ -207,7 +206,7 @@ def test_donuts_of_one_exposure_claim_one_air():
     # The rest of the variance, near the ground, all have in common.
     values = rng.normal(0.0, np.sqrt((1.0 - GROUND) / 19) * 128e-9, (10, 19))
     parts = [replace(parts_of(20e-9), air=np.eye(19) * rms**2 / 19) for rms in air_rms]
-    checked = cross_checked(fields, values, parts, np.ones(10, dtype=bool), lambda: np.eye(19) / 19, measured_air=True)
+    checked = cross_checked(fields, values, parts, np.ones(10, dtype=bool), lambda: np.eye(19) / 19, shared=GROUND)
     claimed = np.array([np.sqrt(np.trace(errors.air)) for errors in checked])
     np.testing.assert_allclose(claimed, claimed[0], rtol=1e-12)
     assert claimed[0] == pytest.approx(np.sqrt(np.mean(air_rms**2)), rel=0.15)
@@ -217,13 +216,13 @@ def test_a_star_on_both_sides_of_focus_claims_what_its_sides_differ_by():
     fields, sides = np.zeros((2, 2)), np.array([True, False])
     values = np.outer([0.5, -0.5], np.where(np.arange(19) == 7, 300e-9, 0.0))
     parts, air = [parts_of(20e-9)] * 2, lambda: np.eye(19) / 19
-    checked = cross_checked(fields, values, parts, sides, air, measured_air=True)
+    checked = cross_checked(fields, values, parts, sides, air, shared=GROUND)
     difference = checked[0].total + checked[1].total
     assert np.sqrt(np.trace(difference)) == pytest.approx(300e-9, rel=0.01)
     # Half of it in the term that differs, beside its part of the rest.
     assert difference[7, 7] == pytest.approx((0.5 + 0.5 / 19) * 300e-9**2, rel=0.01)
     # Two donuts of one side may be of two exposures.
-    alone = cross_checked(fields, values, parts, ~sides | sides, air, measured_air=True)
+    alone = cross_checked(fields, values, parts, ~sides | sides, air, shared=GROUND)
     assert np.sqrt(np.trace(alone[0].total)) == pytest.approx(20e-9)
 
 
@@ -237,7 +236,7 @@ def test_repeats_of_one_chip_differ_by_less_than_what_the_model_lacks_in_all_of_
         [parts_of(5e-9, 200e-9)] * 4,
         np.ones(4, dtype=bool),
         lambda: np.eye(19) / 19,
-        measured_air=True,
+        shared=GROUND,
     )
     assert np.sqrt(np.trace(checked[0].total)) == pytest.approx(200e-9, rel=0.01)
     assert np.sqrt(np.trace(checked[0].repeats)) == pytest.approx(30e-9, rel=0.3)

@@ -7,9 +7,11 @@ import pytest
 
 from pachon.models.zernike_polynomials import annular_zernikes, noll_to_nm
 from pachon.sensing.air_shape import air_shape
-from pachon.sensing.hierarchy import GROUND, Basis, Observations, fit_hierarchy, star_numbers
+from pachon.sensing.hierarchy import Basis, ExposureAir, Observations, fit_hierarchy, star_numbers
 
 NOLL = np.arange(4, 12)
+#: Part of the air that donuts share.
+GROUND = 0.66
 
 
 def field_basis(places, last=3):
@@ -54,7 +56,7 @@ def test_posterior_is_that_of_dense_algebra():
     star, exposure = np.array([0, 0, 1, 1, 2, 2, 3]), np.array([0, 1, 0, 1, 0, 1, 0])
     observations, _, _ = drawn(rng, places, star=star, exposure=exposure, air=60e-9, local=20e-9)
     basis = field_basis(places)
-    fit = fit_hierarchy(observations, basis, shape())
+    fit = fit_hierarchy(observations, basis, ExposureAir(shape(), GROUND))
     sizes, n, count = fit.sizes, len(NOLL), len(places)
     prior = np.diag(basis.variances(sizes))
     columns = basis.columns.reshape(count * n, -1)
@@ -84,7 +86,7 @@ def test_errors_are_those_claimed(air, scale):
         rng = np.random.default_rng(seed)
         places, star, exposure = places_of(rng, 12), np.arange(12), np.zeros(12, dtype=int)
         observations, telescope, total = drawn(rng, places, star=star, exposure=exposure, air=air, scale=scale)
-        fit = fit_hierarchy(observations, field_basis(places), shape())
+        fit = fit_hierarchy(observations, field_basis(places), ExposureAir(shape(), GROUND))
         squares.append(
             [
                 np.mean([e @ np.linalg.solve(c, e) for e, c in zip(error, covariance, strict=True)]) / len(NOLL)
@@ -109,7 +111,11 @@ def test_high_orders_of_bent_mirrors_keep_their_slopes_over_the_field():
     )
     change = np.zeros_like(telescope)
     change[:, 0], change[:, -1] = 800e-9 * places[:, 0], 10e-9 * places[:, 1]
-    fit = fit_hierarchy(replace(observations, zernikes=observations.zernikes + change), field_basis(places), shape())
+    fit = fit_hierarchy(
+        replace(observations, zernikes=observations.zernikes + change),
+        field_basis(places),
+        ExposureAir(shape(), GROUND),
+    )
     error = (fit.telescope - telescope - change)[:, -1]
     # The noise of three field terms by twelve donuts is 3 nm; without slopes the error would be 6 nm.
     assert np.std(error) < 3.5e-9
@@ -120,7 +126,7 @@ def test_sizes_are_those_drawn():
     rng = np.random.default_rng(1)
     places, star, exposure = places_of(rng, 60), np.arange(60), np.zeros(60, dtype=int)
     observations, _, _ = drawn(rng, places, star=star, exposure=exposure, air=90e-9, scale=2.0)
-    sizes = fit_hierarchy(observations, field_basis(places), shape()).sizes
+    sizes = fit_hierarchy(observations, field_basis(places), ExposureAir(shape(), GROUND)).sizes
     assert sizes.air == pytest.approx(90e-9, rel=0.15)
     assert sizes.noise == pytest.approx(2.0, rel=0.2)
 
