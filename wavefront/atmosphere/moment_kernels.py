@@ -14,8 +14,8 @@ wp.set_module_options(FORWARD_OPTIONS)
 #: Baselines in one packet.
 LANES = 16
 baselines = wp.types.vector(LANES, wp.float32)
-#: Averages of one delay: slope covariances a, b, c, and their products of the second order, and of the fourth.
-TERMS = 12
+#: Averages of one delay: slope covariances a, b, c, and their products of the second, fourth and sixth order.
+TERMS = 15
 delay_terms = wp.types.vector(TERMS, wp.float64)
 #: Number of slope covariances among them.
 SLOPES = wp.constant(3)
@@ -63,10 +63,12 @@ _BASELINE_LOOP = f"""
         }}
         const packet w = point[2];
         const packet aa = a * a, bb = b * b, cc = c * c, wb = w * b;
-        // Along the axes, and along the diagonals.
-        const packet middle = 0.5f * (a + c), turned = 0.5f * (c - a);
-        const packet rising = (middle + b) * (middle + b), falling = (middle - b) * (middle - b);
-        const packet square = middle * middle, mixed = turned * turned;
+        // Squares of the mean of the eigenvalues, and of half their difference along axes, diagonals, and both.
+        const packet mean = 0.25f * (a + c) * (a + c), axes = 0.25f * (a - c) * (a - c), apart = axes + bb;
+        const packet same_way = mean * mean, product = mean * apart, across = apart * apart;
+        const packet fourth = w * (same_way - across), of_fourth = 2.0f * w * (apart + 3.0f * mean);
+        const packet sixth = w * (mean - apart) * (same_way + 3.0f * product + across);
+        const packet of_sixth = 2.0f * w * (across + 8.0f * product + 6.0f * same_way);
         sum[0] += w * a;
         sum[1] += wb;
         sum[2] += w * c;
@@ -76,9 +78,12 @@ _BASELINE_LOOP = f"""
         sum[6] += 4.0f * wb * (a - c);
         sum[7] += 2.0f * w * (aa - cc);
         sum[8] += 4.0f * wb * (a + c);
-        sum[9] += w * (aa * aa + cc * cc - 2.0f * bb * bb);
-        sum[10] += w * (rising * rising + falling * falling - 2.0f * mixed * mixed);
-        sum[11] += w * square * square;
+        sum[9] += fourth + axes * of_fourth;
+        sum[10] += fourth + bb * of_fourth;
+        sum[11] += w * (same_way + 4.0f * product + across);
+        sum[12] += sixth + axes * of_sixth;
+        sum[13] += sixth + bb * of_sixth;
+        sum[14] += w * (mean + apart) * (same_way + 8.0f * product + across);
     }}
     wp::vec_t<{TERMS}, wp::float64> averages;
     for (int k = 0; k < {TERMS}; ++k) {{
@@ -139,10 +144,10 @@ def average_products(
     of the packets of each delay; baseline [packet, 3] of the pupil: x, y [m], weight of sum 1; altitude, velocity,
     weight of the layers; isotropic and directed: tables of the slopes' covariance, zero at the end; per_step: one over
     their step [1/m]; farthest: distance of a layer's centre from which on none of its baselines is within the tables
-    [m]; common [delay, 12]: the terms of layers on the ground alone; where it is empty, these are computed too; ground
+    [m]; common [delay, 15]: the terms of layers on the ground alone; where it is empty, these are computed too; ground
     [packet, 3]: covariances a, b, c of these layers, which are computed with the terms, and zero before; place [lag,
-    layer, 3]: room; squares [lag, 9]: averages of pp, qq, ss, pq, ps, qs, and of fourth powers: a^4 + c^4 - 2 b^4, the
-    same at 45 degrees, (a + c)^4 / 16; terms [lag, delay, 3 or 12]: averages of a, b, c over the baselines, and where
+    layer, 3]: room; squares [lag, 12]: averages of pp, qq, ss, pq, ps, qs, and of the products of the fourth and of the
+    sixth order that act as p, q and s; terms [lag, delay, 3 or 15]: averages of a, b, c over the baselines, and where
     there is room of the products that make the squares. p = xx - yy, q = 2 xy, s = xx + yy.
     """
     item = first + wp.tid()

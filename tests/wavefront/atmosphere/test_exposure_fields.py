@@ -14,7 +14,9 @@ from pachon.wavefront.atmosphere.spline import stencil_gain
 
 AIR = ExposedAir((0.0, 5000.0), (0.6, 0.4), ((3.0, 2.0), (-4.0, 9.0)), 5.0, 0.16, 25.0, 8.75, 4.0, 0.4)
 #: That of an ideal 8.4 m telescope at 620 nm, r0 = 0.16 m, under a weight of 0.7 arcsec [1/rad^2].
-RESPONSE = MomentResponse(2.72 / ARCSEC**2, 2.85 / ARCSEC**2, -44.3 / ARCSEC**2, -29.3 / ARCSEC**2)
+RESPONSE = MomentResponse(
+    2.72 / ARCSEC**2, 2.85 / ARCSEC**2, (44.3 / ARCSEC**2, 2600.0 / ARCSEC**4), (58.6 / ARCSEC**2, 3400.0 / ARCSEC**4)
+)
 FIELD_RADIUS = math.radians(0.3)
 
 

@@ -138,6 +138,31 @@ def test_against_sums_over_a_small_pupil(lag):
     assert got == pytest.approx(expected, abs=0.02 * expected[2, 2])
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("lag", [(0.0, 0.0), (-20 * ARCSEC, 40 * ARCSEC)])
+def test_higher_orders_against_sums_over_a_small_pupil(lag):
+    """Parts of (n.S n')^N/N! that go as cos 2phi, sin 2phi and no angle, by sums over six directions each.
+
+    At N = 2 these are the moments of the second order, p and q by a factor of 64, s of 16.
+    """
+    points, times = pupil_points(0.25), AIR.exposure * (np.arange(40) + 0.5) / 40
+    slopes = between_stars(lag, points, times)
+    angles = np.pi * np.arange(6) / 6
+    means = np.zeros((3, 3))
+    for phi in angles:
+        along = slopes @ [np.cos(phi), np.sin(phi)]
+        for psi in angles:
+            projected = along @ [np.cos(psi), np.sin(psi)]
+            factors = np.array([np.cos(2 * phi) * np.cos(2 * psi), np.sin(2 * phi) * np.sin(2 * psi), 0.25]) * 64 / 36
+            for row, order in enumerate((2, 4, 6)):
+                means[row] += factors * np.mean(projected**order) / math.factorial(order)
+    covariance = moment_covariance(AIR, np.array([lag]))
+    got = np.array([covariance.second[0, :3], *covariance.higher[:, 0]])
+    # The mean slope, which takes a part of the second order, is left in these sums.
+    assert got[1:] == pytest.approx(means[1:], rel=0.03)
+    assert np.all(got[0] < means[0])
+
+
 def test_covariances_are_even_and_of_one_process():
     """A lag and its opposite have the same covariances, and stars far apart share what the ground layer does alone."""
     lags = np.array([[0.0, 0.0], [1.0, 0.5], [-1.0, -0.5], [300.0, 0.0]]) * ARCMIN
@@ -154,14 +179,13 @@ def test_bytes_do_not_depend_on_threads():
     lags = np.random.default_rng(0).uniform(-1e-3, 1e-3, (6, 2))
     one, two = (moment_covariance(AIR, lags, threads=n) for n in (1, 2))
     assert one.second.tobytes() == two.second.tobytes()
-    assert one.fourth.tobytes() == two.fourth.tobytes()
+    assert one.higher.tobytes() == two.higher.tobytes()
 
 
 def test_response_of_a_gaussian():
     """Of a Gaussian image of variance s2 under a Gaussian weight w2: e and ln size in closed form.
 
-    Q = s2 w2 / (s2 + w2) along each axis, e = (Qx - Qy) / (2 (Qx + Qy)), and a fourth cumulant c along x adds
-    c / 24 d^4/dx^4 to the image.
+    Q = s2 w2 / (s2 + w2) along each axis, e = (Qx - Qy) / (2 (Qx + Qy)).
     """
     sigma, weight = 0.35, 0.3
     k = np.linspace(0.0, 6.0 / weight, 4000)
@@ -175,5 +199,14 @@ def test_response_of_a_gaussian():
     assert response.ellipticity == pytest.approx(0.5 * (qx - qy) / (qx + qy) / step, rel=1e-4)
     q1, q2 = narrowed(sigma**2 + 0.5 * step), narrowed(sigma**2)
     assert response.ln_size == pytest.approx(0.5 * math.log(q1 / q2) / step, rel=1e-4)
-    # The weighted transfer function is a Gaussian of variance s2 + w2: J6 / J4 = 6 / (s2 + w2).
-    assert response.fourth_ellipticity == pytest.approx(-6.0 / (sigma**2 + weight**2), rel=1e-4)
+    # The weighted transfer function is a Gaussian of variance s2 + w2: J6 / J4 = 6 / (s2 + w2), J8 / J6 a third more.
+    total = sigma**2 + weight**2
+    assert response.higher_ellipticity == pytest.approx((6.0 / total, 48.0 / total**2), rel=1e-4)
+    # A round change of the image that goes as k^4 or k^6 of the weighted transfer function.
+    step, power = 1e-7, np.exp(-0.5 * total * k**2)
+    for order, expected in ((4, response.higher_size[0]), (6, response.higher_size[1])):
+        sizes = []
+        for change in (0.0 * k, step * k**order, step * k**2):
+            j0, j2 = (np.sum(power * (1.0 + change) * k**n) for n in (1, 3))
+            sizes.append(math.log(weight**2 - 0.5 * weight**4 * j2 / j0))
+        assert (sizes[1] - sizes[0]) / (sizes[2] - sizes[0]) == pytest.approx(expected, rel=1e-3)
