@@ -186,7 +186,7 @@ class ExposureDonuts(WavefrontFit):
         return star_numbers(fields, SAME_STAR, self.stars)
 
     def _freedoms(
-        self, usable: UsableStars, observations: Observations, shape: np.ndarray, air: float | None
+        self, usable: UsableStars, observations: Observations, air: ExposureAir
     ) -> tuple[Hierarchy, Basis, FreedomEstimate]:
         """Return the wavefronts where the telescope's is made by degrees of freedom, linear about their estimate."""
         assert self.freedoms is not None
