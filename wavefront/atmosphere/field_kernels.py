@@ -11,8 +11,10 @@ wp.set_module_options(FORWARD_OPTIONS)
 #: Covariances of the components of the moments.
 pairs = wp.types.vector(6, wp.float32)
 #: Zernikes of the mean wavefront.
-TERMS = 8
+TERMS = 12
 zernikes = wp.types.vector(TERMS, wp.float32)
+#: Cosines and sines of multiples of an angle, from 0 to 4 times it.
+turned = wp.types.vector(10, wp.float32)
 
 
 @wp.func
@@ -127,12 +129,12 @@ def factor_spectra(
 
 @wp.func
 def multiple_angles(direction: wp.vec2f):
-    """Cosine and sine of multiples of the angle of a unit vector: of 0, 1, 2 and 3 times it."""
+    """Cosine and sine of multiples of the angle of a unit vector: of 0 to 4 times it."""
     cosine = direction[0]
     sine = direction[1]
     cosine_two = cosine * cosine - sine * sine
     sine_two = wp.float32(2.0) * sine * cosine
-    return zernikes(
+    return turned(
         wp.float32(1.0),
         wp.float32(0.0),
         cosine,
@@ -141,6 +143,8 @@ def multiple_angles(direction: wp.vec2f):
         sine_two,
         cosine_two * cosine - sine_two * sine,
         sine_two * cosine + cosine_two * sine,
+        cosine_two * cosine_two - sine_two * sine_two,
+        wp.float32(2.0) * sine_two * cosine_two,
     )
 
 
@@ -167,7 +171,7 @@ def add_wavefronts(
     columns 0 to reach [layer]; distance [layer] along the line of sight [m]; drift [layer, 2] in the exposure [m];
     strength [layer]: amplitudes of a mode but for the power of its frequency; frequency_step of the field [cycles/rad];
     radial [k]: mean over the pupil of a term's radial part times a wave, with the root of the power of the frequency,
-    against the frequency, whose table has per_frequency steps a cycle/m; order [term] m of the Zernikes, -3 to 3,
+    against the frequency, whose table has per_frequency steps a cycle/m; order [term] m of the Zernikes, -4 to 4,
     negative for sines; gain [row] of splines along either axis; unit of the strength in that of the results; spectrum
     [term, row, column].
     """

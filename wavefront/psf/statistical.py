@@ -51,7 +51,7 @@ FAR_ANGLE = 1.0 * ARCSEC
 # Wavenumbers of the response, and the largest in units of one over the weight's rms width.
 _WAVENUMBERS = 512
 _HIGHEST = 6.0
-# Points along the radius and the angle of means over the pupil: exact for the gradients of Z4 to Z11.
+# Points along the radius and the angle of means over the pupil: exact for the gradients of Z4 to Z15.
 _RADII = 16
 _ANGLES = 16
 
