@@ -17,9 +17,9 @@ are uncorrelated (Hermite polynomials of Gaussian slopes); their covariances are
 
 .. math:: \left\langle \frac{(\mathbf{k} \cdot S \, \mathbf{k}')^n}{n!} \right\rangle
 
-that go as cos 2phi, sin 2phi and no angle of both wavenumbers. In 15 s of the LSST the fourth order adds 7 % to the
-variances and 23 % to half-variograms at 1', the sixth 0.7 % and 4 %, the eighth, left out, 0.06 % and 0.6 %. They are
-included as moments of the second order of the same effect.
+that go as cos 2phi, sin 2phi and no angle of both wavenumbers. In 15 s of the LSST the fourth order adds 3 % to the
+variances and 7 to 10 % to half-variograms at 1', the sixth 0.1 % and 0.7 %. They are included as
+moments of the second order of the same effect.
 """
 
 from __future__ import annotations

@@ -44,12 +44,12 @@ def test_bytes_do_not_depend_on_threads_and_other_stars(lsst, air, drawn):
 
 
 @pytest.mark.long
-def test_an_exposure_of_ideal_optics_is_the_long_one_under_its_kernel(lsst, air):
+def test_an_exposure_of_ideal_optics_is_the_long_one_under_its_kernel(lsst):
     """Without aberrations nothing is left of the mean wavefront but its own moments, which are taken away again.
 
     The long exposure is convolved here by a Fourier transform of its stamp, with the moments drawn.
     """
-    ideal = ideal_telescope(lsst, 1e5)
+    ideal, air = ideal_telescope(lsst, 1e5), pachon.Atmosphere.from_site("cerro_pachon", 4, exposure=40.0)
     scale = 0.2 * ARCSEC
     stamps = Stamps(61, scale * ideal.reference_sphere_radius, 0.0)
     images = [
@@ -69,9 +69,9 @@ def test_an_exposure_of_ideal_optics_is_the_long_one_under_its_kernel(lsst, air)
         shapes = pachon.measure_shapes(np.stack([images[0][star], blurred, images[1][star]]), scale, 0.7 * ARCSEC)
         assert np.hypot(shapes.e1[2] - shapes.e1[0], shapes.e2[2] - shapes.e2[0]) > 5e-4
         left.append([shapes.e1[2] - shapes.e1[1], shapes.e2[2] - shapes.e2[1], np.log(shapes.size[2] / shapes.size[1])])
-    # The mean wavefront's own third and fourth moments: 0.7, 0.9 and 1.2e-4 (rms of 144 stars). The kernel moves e by
-    # some 2e-3.
-    assert np.all(np.sqrt(np.mean(np.square(left), axis=0)) < 1.5e-4)
+    # The mean wavefront's own third and fourth moments: 0.7, 0.9 and 1.2e-4 (rms of 144 stars) in 10 s, less in 40 s.
+    # The kernel moves e by some 1e-3.
+    assert np.abs(left).max() < 6e-5
 
 
 @pytest.mark.long
