@@ -16,6 +16,7 @@ import numpy as np
 import scipy.fft
 import warp as wp
 
+from ...core.buffers import empty
 from ...core.errors import DomainError
 from ...core.launch import launch
 from ...core.random_streams import stream
@@ -126,7 +127,7 @@ def draw_exposure(
     random = stream(seed, "atmosphere", epoch, "moments")
     common = shared @ random.standard_normal(3)
     modes = [_white_modes(random, grid.size, grid.size // 2 + 1, grid.size) for _ in range(3)]
-    moments = _fields(sum(f * m for f, m in zip(row, modes, strict=False)) for row in factors)
+    moments = _fields((sum(f * m for f, m in zip(row, modes, strict=False)) for row in factors), 3, grid.size)
     ground, wavefronts = _draw_wavefronts(air, grid, seed, epoch)
     return ExposureFields(common, SplineFields(grid.side, moments), ground, wavefronts)
 
@@ -187,10 +188,13 @@ def _factors(spectra: np.ndarray, scale: float) -> tuple[tuple[np.ndarray, ...],
     return (first,), (second, middle), (third, mixed, last)
 
 
-def _fields(spectra: Iterable[np.ndarray]) -> np.ndarray:
-    """Return the fields of spectra [size, size // 2 + 1], float32, [n_field, size, size]."""
+def _fields(spectra: Iterable[np.ndarray], count: int, size: int) -> np.ndarray:
+    """Return the fields of so many spectra [size, size // 2 + 1], float32, [n_field, size, size]."""
+    fields = empty((count, size, size), np.float32)
     # One by one: the memory of all at once takes longer to get than their transforms.
-    return np.stack([scipy.fft.irfft2(spectrum, s=(len(spectrum),) * 2, overwrite_x=True) for spectrum in spectra])
+    for field, spectrum in zip(fields, spectra, strict=True):
+        field[:] = scipy.fft.irfft2(spectrum, s=(size, size), overwrite_x=True)
+    return fields
 
 
 def _white_modes(random: np.random.Generator, rows: int, columns: int, size: int) -> np.ndarray:
@@ -267,7 +271,7 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
     radial = root[:, None] * np.stack([radial_transform(j, _LAST, _TABLE + 1, air.obscuration) for j in NOLL], axis=1)
     amplitude = scale * size * np.sqrt(weights) / (distance * side)
     strength = amplitude[:, None] * _compensation(nu, radial**2, np.hypot(*drift.T))
-    spectrum = np.empty((len(NOLL), size, size // 2 + 1), dtype=np.complex64)
+    spectrum = empty((len(NOLL), size, size // 2 + 1), np.complex64)
     launch(
         add_wavefronts,
         size,
@@ -287,7 +291,7 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
             warp_array(spectrum, wp.vec2f),
         ],
     )
-    return SplineFields(side, _fields(spectrum))
+    return SplineFields(side, _fields(spectrum, len(NOLL), size))
 
 
 def _compensation(frequency: np.ndarray, power: np.ndarray, drift: np.ndarray) -> np.ndarray:

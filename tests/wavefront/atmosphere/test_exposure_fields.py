@@ -62,7 +62,7 @@ def test_half_variograms_between_samples():
     for _ in range(64):
         modes = [exposure_fields._white_modes(random, grid.size, grid.size // 2 + 1, grid.size) for _ in range(3)]
         spectra = [sum(f * m for f, m in zip(row, modes, strict=False)) for row in factors]
-        fields = SplineFields(grid.side, exposure_fields._fields(spectra))
+        fields = SplineFields(grid.side, exposure_fields._fields(spectra, 3, grid.size))
         values = fields.at(places)
         squares += [((fields.at(places + lag) - values) ** 2).mean(axis=0) for lag in lags]
     ratio = (squares / 128 / (covariance[0] - covariance[1:])).reshape(3, 2, 3).mean(axis=1)
