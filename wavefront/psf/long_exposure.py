@@ -98,6 +98,8 @@ class LongExposureEngine(PsfEngine):
     has_turbulence = False
     #: Points on spokes by default.
     spoke_points: ClassVar[int] = PUPIL_POINTS
+    #: The same of a lattice in a disc, where anything but discs and rings stops light.
+    lattice_points: ClassVar[int] = LATTICE_POINTS
 
     n_pupil: int | None = None
 
@@ -108,7 +110,7 @@ class LongExposureEngine(PsfEngine):
     @classmethod
     def default_points(cls, telescope: Telescope) -> int:
         """Return the points by default: on spokes where only discs and rings stop light, else of a lattice."""
-        return cls.spoke_points if has_only_annuli(telescope) else LATTICE_POINTS
+        return cls.spoke_points if has_only_annuli(telescope) else cls.lattice_points
 
     def _renderer(self, inputs: PsfInputs) -> LongExposureRenderer:
         return LongExposureRenderer(inputs, self)
@@ -141,9 +143,9 @@ class LongExposureRenderer(PsfRenderer):
         rings = has_only_annuli(self._telescope)
         # Whether every star needs the lattice in place of strips along the rims.
         self._general = not rings or not self._strips_suffice()
-        count = options.n_pupil or LATTICE_POINTS
+        count = options.n_pupil or options.lattice_points
         if rings:
-            count = LATTICE_POINTS if self._general else RINGS_POINTS
+            count = options.lattice_points if self._general else RINGS_POINTS
         self._lattice = LatticeTransfer.fill(self._diameter, self._obscuration, count, self._wavelengths)
         self._choose_frequencies()
         self._tabulate_pixels()
