@@ -115,7 +115,8 @@ def _visits(
     columns.require("ra"), columns.require("dec")
     ra = columns.complete("ra", lambda angle: np.abs(angle) <= 4.0 * np.pi, "a finite angle") % (2.0 * np.pi)
     dec = columns.complete("dec", lambda angle: np.abs(angle) <= 0.5 * np.pi, "-90 to 90 deg")
-    snaps = columns.numbers("snaps", 1.0)
+    snaps = columns.stated("snaps", _is_whole, "a whole number")
+    # Of no number, and of 0, the exposure is not divided.
     snaps = np.where(snaps >= 1.0, snaps, 1.0).astype(np.int64)
     exposure = _exposure_times(columns, snaps)
     midpoint = _midpoints(columns, exposure, snaps)
