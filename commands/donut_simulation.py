@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.errors import ConfigError
+from ..core.number_text import counted
 from ..core.terminal import print_line
 from .interrupt import interruptible
 from .options import degrees_pair, wavelength_list
@@ -39,4 +40,4 @@ def simulate_file(
         donuts = simulate_donuts(telescope, true, scene, model, field)
     write_donuts(files[0], donuts, scene, model, name)
     if not quiet:
-        print_line(f"{files[0]}: {len(donuts.fields)} donuts, moved: {model.detector.moved}")
+        print_line(f"{files[0]}: {counted(len(donuts.fields), 'donut')}, moved: {model.detector.moved}")

@@ -11,6 +11,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError, PachonError, PrescriptionWarning, ProductError
+from ..core.number_text import counted
 from ..core.terminal import print_line, print_warning
 from . import completion
 from .choices import choice, names
@@ -392,7 +393,7 @@ def donuts_command(
     with (
         warnings_shown(PrescriptionWarning),
         interruptible(quiet) as reporter,
-        reporter.stage(f"wavefronts of {len(inputs.images)} donuts", total=len(inputs.images)) as stage,
+        reporter.stage(f"wavefronts of {counted(len(inputs.images), 'donut')}", total=len(inputs.images)) as stage,
     ):
         fit = fit_donuts(
             believed,

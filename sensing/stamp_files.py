@@ -23,6 +23,7 @@ from astropy.table import Table
 from ..core.errors import ProductError
 from ..core.files import parsing, require_file
 from ..core.fits_files import open_fits
+from ..core.number_text import counted
 from ..core.table_files import text_table
 from .inputs import SMALLEST_STAMP
 from .stamp_headers import HeaderValues, corner_of, defocus_of, detector_of, header_values, pixel_of, stamp_header
@@ -241,7 +242,7 @@ def _with_planes(
         file = {"mask": mask, "variance": variance}.get(kind) or path
         if kind != "image" and listed and [d.shape for _, d in listed] != [d.shape for _, d in images]:
             shapes, expected = ([list(d.shape) for _, d in units_of[:1]] for units_of in (listed, images))
-            counts = f"{len(listed)} of shape {shapes[0]} for {len(images)} images" + (
+            counts = f"{len(listed)} of shape {shapes[0]} for {counted(len(images), 'image')}" + (
                 f" of {expected[0]}" if expected else ""
             )
             raise ProductError(f"planes of {kind}: {counts}: expected one for each image, as large", file=file)
@@ -372,7 +373,8 @@ def _places(table: Table, count: int, file: Path) -> tuple[np.ndarray | None, np
     """Return field angles [rad] and shifts of the body that moves [m]; None without columns."""
     names = _names(table)
     if len(table) != count:
-        raise ProductError(f"table of {len(table)} rows for {count} stamps: expected one row a stamp", file=file)
+        rows, stamps = counted(len(table), "row"), counted(count, "stamp")
+        raise ProductError(f"table of {rows} for {stamps}: expected one row a stamp", file=file)
     fields = None
     if {"field_x", "field_y"} <= names:
         fields = np.deg2rad(np.stack([_column(table, name, file) for name in ("field_x", "field_y")], axis=-1))

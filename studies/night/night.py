@@ -13,6 +13,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError, PachonError, ProductError
 from ...core.files import make_folder
 from ...core.long_work import Execution, claim_folder
+from ...core.number_text import counted
 from ...core.products import Stamp
 from ...pipeline.experiment import Experiment
 from ...pipeline.listed_visit import check_bands, visit_experiment
@@ -117,7 +118,7 @@ def run_night(
     finished = _finished(config, experiment, paths, stamp, execution)
     due = [i for i in range(number - 1, len(visits), parts) if int(visits.visit[i]) not in finished]
     if finished:
-        reporter.line(f"{len(finished)} of {len(visits)} visits are finished already")
+        reporter.line(f"{len(finished)} of {counted(len(visits), 'visit is', 'visits are')} finished already")
     write = partial(write_night, folder, config, experiment, visits, stamp)
     written = len(finished)
     for visit, reason in _results(
@@ -159,7 +160,7 @@ def _results(
         partial(work.compute_here, execution.reporter) if alone else work,
         [visit.label for visit in due],
         due,
-        title=None if alone else f"{len(due)} visits",
+        title=None if alone else counted(len(due), "visit"),
         folder=folder,
         product=lambda number: folder / product_name(due[number].visit),
         check=lambda processes: check_memory(experiment, execution.threads if alone else 1, copies=processes),

@@ -11,6 +11,7 @@ from matplotlib.collections import QuadMesh
 from matplotlib.colors import Normalize
 from matplotlib.ticker import MaxNLocator
 
+from ...core.number_text import counted
 from ...core.plotting import new_figure, png_bytes, styled
 from ...measure.correlation_plots import draw_correlation, log_axes
 from ...measure.focal_plane_axes import AWAY, TRUTH
@@ -70,7 +71,7 @@ def correlations_plot(means: Mapping[str, Mapping[str, MeanCorrelation]]) -> byt
             for kind, correlation in kinds.items():
                 draw_correlation(axes, correlation, "plus", *_LABELS[kind])
             visits = max(correlation.visits for correlation in kinds.values())
-            log_axes(axes, f"{band}, {visits} visit{'s' if visits > 1 else ''}")
+            log_axes(axes, f"{band}, {counted(visits, 'visit')}")
             axes.set_xlabel("separation [arcmin]")
         panels[0].set_ylabel("$|\\xi_+|$ of g, mean over visits")
         panels[0].legend(loc="best")

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import DomainError, PachonError, ProductError
+from ...core.number_text import counted
 from ...core.products import Columns, Stamp, column, is_whole, read_fits, table_hdu, write_fits
 from ...core.progress import Reporter
 from ...models.camera.camera import Camera
@@ -158,7 +159,7 @@ class VisitWork:
                 reduce,
                 names,
                 fields={name: _fields(experiment, name, self.config.models) for name in names},
-                title=f"{visit.label}, {visit.band}: {len(names)} CCDs",
+                title=f"{visit.label}, {visit.band}: {counted(len(names), 'CCD')}",
                 strict=False,
                 together=_STARS_TOGETHER,
                 threads=threads,

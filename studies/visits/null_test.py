@@ -13,6 +13,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError, error_context
 from ...core.files import make_folder, write_bytes, write_json
 from ...core.long_work import Execution
+from ...core.number_text import counted
 from ...core.products import Stamp, column, read_fits, table_hdu, write_fits
 from ...core.random_streams import natural_number
 from ...core.units import ARCMIN
@@ -100,7 +101,8 @@ def null_test(
         galaxies_in = source.down_to(faintest := stack_limit(experiment, FAINTEST_SNR, visits))
         covered_tiles = _covered_tiles(stack, cell, config.visits.places)[:tiles]
         if not covered_tiles:
-            raise DomainError(f"{folder}: no part of the sky as large as a CCD was seen by half of {visits} visits")
+            seen_by = counted(visits, "visit")
+            raise DomainError(f"{folder}: no part of the sky as large as a CCD was seen by half of {seen_by}")
         paths = {
             (i, j): folder / "galaxies" / f"visits_{visits:04d}_tile_{i:+03d}_{j:+03d}.fits" for i, j in covered_tiles
         }
@@ -111,7 +113,7 @@ def null_test(
             measure_job,
             [*(paths[tile].stem for tile in todo), *(f"ring {k}, shear {sign:+.0f}" for k, sign in _RING_JOBS)],
             depth.jobs(todo, covered_tiles, rings),
-            title=f"galaxies in {visits} visits",
+            title=f"galaxies in {counted(visits, 'visit')}",
         ) as results:
             for tile in todo:
                 write_shapes(paths[tile], next(results), stamp)
@@ -119,10 +121,11 @@ def null_test(
         # Read from the files, as by a resumed test, so that both have the same numbers.
         parts = [read_shapes(path, stamp) for path in paths.values()]
         if (n := sum(int(shapes.usable_twice.sum()) for shapes in parts)) < 2:
-            text = f"{n} of {sum(map(len, parts))} galaxies to magnitude {faintest:.2f} are usable in {visits} visits"
+            galaxies = counted(sum(map(len, parts)), "galaxy", "galaxies")
+            text = f"{n} of {galaxies} to magnitude {faintest:.2f} usable in {counted(visits, 'visit')}"
             raise DomainError(f"{folder}: {text}; expected two or more, of the galaxies of {CONFIG_NAME}")
         ring_count = len(depth.first_galaxies(covered_tiles, rings))
-        with execution.reporter.stage(f"correlations in {visits} visits"):
+        with execution.reporter.stage(f"correlations in {counted(visits, 'visit')}"):
             psfs = PsfAtGalaxies.of(stack, GalaxyShapes.joined(parts), depth.psf_error_response(covered_tiles))
             biases = ShearBiases(
                 _calibration(frame.matrix, ring_count, measured_rings),

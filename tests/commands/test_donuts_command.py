@@ -99,7 +99,7 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
             ["plain.fits"],
             "plain.fits: no field angles: expected FIELD_X and FIELD_Y, a table with them, or --field-deg",
         ),
-        (["rows.fits"], "rows.fits: table of 1 rows for 2 stamps: expected one row a stamp"),
+        (["rows.fits"], "rows.fits: table of 1 row for 2 stamps: expected one row a stamp"),
         (["plain.fits", "--field-deg", "1,2,3"], "--field-deg = '1,2,3': expected"),
         (["plain.fits", "-o", "table.txt"], "--out = table.txt: expected a name that ends in"),
         (["plain.fits", "--picture", "a.gif"], "expected a name that ends in .png"),
@@ -128,7 +128,7 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
         (["plain.fits", "--rotator-deg", "nan"], "--rotator-deg = nan: expected a finite number of degrees"),
         (["plain.fits", "--frame", "sky"], "frame sky without a parallactic angle: expected --parallactic-deg"),
         (["plain.fits", "--gain", "0", "--field-deg", "0,0"], "--gain = 0.0: expected electrons of a unit, above 0"),
-        (["plain.fits", "--mask", "rows.fits", "--field-deg", "0,0"], "1 of shape [3, 16, 16] for 1 images of [2, 16"),
+        (["plain.fits", "--mask", "rows.fits", "--field-deg", "0,0"], "1 of shape [3, 16, 16] for 1 image of [2, 16"),
         (["plain.fits", "plain.fits", "--mask", "plain.fits"], "for 2 files: expected one file of stamps with it"),
         (
             ["plain.fits", "--defocus-um", "nan", "--field-deg", "0,0"],

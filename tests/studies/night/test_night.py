@@ -176,7 +176,7 @@ def test_a_list_that_has_changed_is_refused(night, night_config):
 
 
 def test_bands_that_the_telescope_has_not(night_config, tmp_path):
-    with pytest.raises(ConfigError, match=r"band i, 1 visits of visits.csv: .*has no band i"):
+    with pytest.raises(ConfigError, match=r"band i, 1 visit of visits.csv: .*has no band i"):
         run_night(night_config({"telescope": "comcam_r", "ccds": None}), tmp_path / "night")
     assert not (tmp_path / "night").exists()
 
