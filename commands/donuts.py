@@ -491,11 +491,12 @@ def _write(fit: DonutFit, converted: ObservatoryZernikes, table: Path | None, pi
     """Write the table and the picture of a fit, where they are asked for."""
     from ..core.files import write_bytes
     from ..core.plotting import picture_bytes
-    from ..core.table_files import write_table
+    from ..core.table_files import in_format_of, write_table
 
     if table is not None:
         # The default is a table without a word of frames.
         plain = converted.convention == "pachon" and converted.frame == "OCS"
-        write_table(table, fit.to_table() if plain else converted.in_table(fit.to_table()))
+        wavefronts = fit.to_table() if plain else converted.in_table(fit.to_table())
+        write_table(table, in_format_of(table, wavefronts))
     if picture is not None:
         write_bytes(picture, picture_bytes(fit.plot(), kind))

@@ -329,14 +329,15 @@ def test_tables_have_one_unit_in_every_frame(tmp_path, monkeypatch, stamp):
     monkeypatch.chdir(tmp_path)
     header = fits.Header({"FIELD_X": FIELD[0], "FIELD_Y": FIELD[1]})
     fits.PrimaryHDU(stamp, header).writeto("d.fits")
-    for frame in ("OCS", "CCS"):
-        arguments = ["donuts", "d.fits", *OPTIONS, "--quiet", "--frame", frame, "--no-orientation-check"]
-        assert main([*arguments, "-o", f"{frame}.ecsv"]) == 0
-    telescope, camera = (Table.read(f"{frame}.ecsv") for frame in ("OCS", "CCS"))
-    assert camera["Z5"].unit == camera["Z5_err"].unit == telescope["Z5"].unit == "nm"
+    for table in ("OCS.csv", "CCS.ecsv"):
+        arguments = ["donuts", "d.fits", *OPTIONS, "--quiet", "--frame", table[:3], "--no-orientation-check"]
+        assert main([*arguments, "-o", table]) == 0
+    telescope, camera = Table.read("OCS.csv"), Table.read("CCS.ecsv")
+    assert telescope.colnames[:2] == ["field_x [deg]", "field_y [deg]"]
+    assert camera["Z5"].unit == camera["Z5_err"].unit == "nm"
     assert camera.meta["zernike_unit"] == "nm"
     for name in ("Z4", "Z5", "Z8", "Z8_err"):
-        assert camera[name][0] == pytest.approx(telescope[name][0], rel=1e-9)
+        assert camera[name][0] == pytest.approx(telescope[f"{name} [nm]"][0], rel=1e-9)
 
 
 def test_motions_that_were_not_fitted_are_dashes():
