@@ -2,17 +2,20 @@
 
 import json
 import re
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from astropy.io import fits
 from astropy.table import Table
 from scipy.ndimage import gaussian_filter
 
 import pachon
-from pachon.commands.cli import main
+from pachon.commands.cli import app, main
 from pachon.commands.donut_inputs import StampFiles
+from pachon.commands.donut_options import SimulationOptions, TelescopeOptions
 from pachon.commands.donut_report import motion_rows
 from pachon.sensing.observatory_zernikes import BodyMotions
 from pachon.sensing.stamp_files import read_stamps
@@ -23,6 +26,11 @@ pytestmark = pytest.mark.usefixtures("empty_pictures")
 ROOT = Path(__file__).parents[2]
 FIELD = (0.6, 0.9)
 OPTIONS = ["--defocus-um", "1500", "--pixel-um", "20", "--zernikes", "11", "--higher-order-nm", "0", "--no-diffraction"]
+
+
+# Words for options that take no number; those of others are 3.
+VALUES = {"out": "a.ecsv", "picture": "a.png", "field_frame": "CCS", "frame": "CCS", "convention": "donut",
+          "projection": "postel", "stamp": "30", "terms": "11"}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +117,7 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
             ["plain.fits", "--field-deg", "0,1", "--moved", "Mirror"],
             "moved = 'Mirror': expected a group of lsst_v3.3_r (",
         ),
-        (["plain.fits", "--perturb", "M2.dx=1um"], "--perturb, --set: expected them with --simulate"),
+        (["plain.fits", "--perturb", "M2.dx=1um"], "--perturb: expected with --simulate alone"),
         (["new.fits", "--simulate"], "--defocus-um = 0: expected a shift that makes donuts"),
         (["new.fits", "--simulate", "--perturb", "M2.dx"], "--perturb = 'M2.dx': expected a parameter and its change"),
         (
@@ -120,6 +128,10 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
         (["new.fits", "--simulate", "--set", "star=2"], "--set: unknown key star = 2"),
         (["new.fits", "--simulate", "--set", "stars"], "--set 'stars': expected KEY=VALUE"),
         (["new.fits", "--simulate", "--rotator-deg", "30", "-o", "a.ecsv"], "--rotator-deg, --out: expected without"),
+        (["new.fits", "--simulate", "--json"], "--json: expected without --simulate"),
+        (["plain.fits", "--site", "nowhere"], "--site = nowhere: expected --exposure-s with it"),
+        (["plain.fits", "--field-deg", "0,0", "--exposure-s", "15", "--site", "nowhere"], "unknown site 'nowhere'"),
+        (["plain.fits", "--each-alone", "--degrees-of-freedom", "lsst"], "--each-alone and --degrees-of-freedom: exp"),
         (["new.txt", "--simulate"], "new.txt: --simulate: expected one FILE.fits"),
         (["plain.fits", "--frame", "XYZ"], "--frame = 'XYZ': expected"),
         (["plain.fits", "--field-frame", "ocs"], "--field-frame = 'ocs': expected"),
@@ -338,6 +350,39 @@ def test_tables_have_one_unit_in_every_frame(tmp_path, monkeypatch, stamp):
     assert camera.meta["zernike_unit"] == "nm"
     for name in ("Z4", "Z5", "Z8", "Z8_err"):
         assert camera[name][0] == pytest.approx(telescope[f"{name} [nm]"][0], rel=1e-9)
+
+
+def test_simulations_refuse_all_options_of_fits_and_fits_those_of_simulations(tmp_path, monkeypatch, capsys):
+    """An option that neither uses would be ignored."""
+    monkeypatch.chdir(tmp_path)
+    of_both = {f.name for f in fields(TelescopeOptions)}
+    of_simulations = {f.name for f in fields(SimulationOptions)}
+    command = typer.main.get_command(app).commands["donuts"]
+    options = {p.name: p for p in command.params if p.param_type_name == "option"}
+    assert len(options) > 35
+    for name, option in options.items():
+        value = [] if option.is_flag else [VALUES.get(name, "3")]
+        given = (option.secondary_opts or option.opts)[0] if option.default is True else option.opts[0]
+        simulate = [] if name in of_simulations else ["--simulate"]
+        if name in of_both or name == "simulate":
+            continue
+        assert main(["donuts", "no.fits", *simulate, given, *value]) == 2
+        expected = "expected with --simulate alone" if name in of_simulations else "expected without --simulate"
+        assert capsys.readouterr().err == f"pachon: error: {option.opts[0]}: {expected}\n"
+
+
+def test_an_interrupted_fit_says_that_nothing_is_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    fits.PrimaryHDU(np.zeros((2, 16, 16))).writeto("plain.fits")
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pachon.sensing.fit.fit_donuts", interrupted)
+    assert main(["donuts", "plain.fits", "--field-deg", "0,1", "--defocus-um", "1500", "-o", "a.ecsv"]) == 130
+    error = "pachon: error: interrupted; nothing is written before all donuts are fitted\n"
+    assert capsys.readouterr().err == error
+    assert not (tmp_path / "a.ecsv").exists()
 
 
 def test_motions_that_were_not_fitted_are_dashes():
