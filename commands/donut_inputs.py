@@ -182,7 +182,10 @@ def _fields(
     """Return field angles in the telescope frame: those of the file, or the one given for all stamps."""
     import numpy as np
 
-    if stamps.fields is None and field is None:
-        raise ConfigError("no field angles: expected FIELD_X and FIELD_Y, a table with them, or --field-deg", file=path)
-    angles = np.tile(field, (len(stamps), 1)) if stamps.fields is None else stamps.fields
+    angles = stamps.fields
+    if angles is None:
+        if field is None:
+            text = "no field angles: expected FIELD_X and FIELD_Y, a table with them, or --field-deg"
+            raise ConfigError(text, file=path)
+        angles = np.tile(field, (len(stamps), 1))
     return frames.fields_of_telescope(angles, options.names[0], projection=options.field_projection)

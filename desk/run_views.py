@@ -136,7 +136,7 @@ def run_whiskers(bench: RunBench, state: RunState) -> WhiskersView:
     """Return the adaptive moments of the selected stars at their places; sizes as FWHM of those Gaussians."""
     x, y, g1, g2, sigma = _columns(bench, state, "x", "y", "g1", "g2", "sigma")
     good = np.isfinite(g1) & np.isfinite(g2)
-    title = f"Whiskers, {state.kind}: adaptive moments of {counted(np.count_nonzero(good), 'star')}"
+    title = f"Whiskers, {state.kind}: adaptive moments of {counted(int(np.count_nonzero(good)), 'star')}"
     fwhm = FWHM_PER_RMS * sigma[good] / ARCSEC
     return WhiskersView(1e3 * x[good], 1e3 * y[good], g1[good], g2[good], fwhm, title)
 
@@ -146,7 +146,7 @@ def run_correlation(bench: RunBench, state: RunState) -> Correlation:
     x, y, g1, g2 = _columns(bench, state, "field_x", "field_y", "g1", "g2")
     good = np.isfinite(g1) & np.isfinite(g2)
     if np.count_nonzero(good) < _FEWEST:
-        stars = counted(np.count_nonzero(good), "star is", "stars are")
+        stars = counted(int(np.count_nonzero(good)), "star is", "stars are")
         raise DomainError(f"{stars} selected: expected {_FEWEST} for a correlation")
     longest = max(float(np.hypot(np.ptp(x[good]), np.ptp(y[good]))), 4.0 * _SHORTEST)
     bins = SeparationBins(_SHORTEST, longest, _BINS)

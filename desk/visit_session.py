@@ -117,7 +117,7 @@ class StackSession(PageSession):
     @property
     def state_words(self) -> str:
         """What is shown, in words."""
-        return f"{self.bench.folder.resolve().name}: {counted(self.visits, 'visit')}, {self.kind}"
+        return f"{self.bench.folder.resolve().name}: {counted(int(self.visits), 'visit')}, {self.kind}"
 
     def change(self, name: str, value: str) -> None:
         """Show another stack, or other shapes."""

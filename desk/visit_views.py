@@ -196,7 +196,7 @@ class StackBench:
         size = {STACK_KINDS[0]: stack.size, STACK_KINDS[1]: stack.model_size}.get(kind, stack.size - stack.model_size)
         good = np.isfinite(g1) & np.isfinite(g2)
         fwhm = FWHM_PER_RMS * size[good] / ARCSEC
-        title = f"Stack of {counted(visits, 'visit')}, {kind}: {counted(np.count_nonzero(good), 'point')}"
+        title = f"Stack of {counted(int(visits), 'visit')}, {kind}: {counted(int(np.count_nonzero(good)), 'point')}"
         return WhiskersView(stack.x[good] / ARCMIN, stack.y[good] / ARCMIN, g1[good], g2[good], fwhm, title)
 
     def correlation(self, visits: str, kind: str) -> Correlation:

@@ -14,6 +14,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from astropy import units as u
@@ -212,6 +213,9 @@ def _cut_stamps(
 def _units(path: Path) -> list[tuple[fits.Header, np.ndarray | Table | None]]:
     """Return headers and contents of the units of a FITS file: images, tables, or nothing."""
     require_file(path, ProductError)
+    if path.suffix.lower() in (".npy", ".npz"):
+        text = "expected FITS files of images; pachon.fit_donuts takes arrays"
+        raise ProductError(f"{_arrays_text(path)}: {text}", file=path)
     contents: list[tuple[fits.Header, np.ndarray | Table | None]] = []
     with parsing(path, "cannot be read as FITS", ProductError), open_fits(path, ProductError, memmap=False) as units:
         for unit in units:
@@ -220,6 +224,16 @@ def _units(path: Path) -> list[tuple[fits.Header, np.ndarray | Table | None]]:
             elif isinstance(unit, fits.BinTableHDU) and not unit.header.get("EXTNAME", "").startswith("ARCHIVE"):
                 contents.append((unit.header, Table.read(unit)))
     return contents
+
+
+def _arrays_text(path: Path) -> str:
+    """Return shapes and types of the arrays of a NumPy file, in words."""
+    try:
+        content = np.load(path, mmap_mode="r", allow_pickle=False)
+        arrays = {"array": content} if isinstance(content, np.ndarray) else dict(content)
+    except (OSError, ValueError, EOFError, BadZipFile):
+        return "no file of plain NumPy arrays"
+    return ", ".join(f"{name} of shape {list(array.shape)} and type {array.dtype}" for name, array in arrays.items())
 
 
 def _with_planes(

@@ -198,8 +198,8 @@ class FocalPlaneStars(Result):
         if len(set(lengths.values())) > 1:
             raise DomainError(f"stars: columns of different lengths, {lengths}")
         if "used" in columns and len(np.asarray(columns["used"])) != len(x):
-            values = counted(len(np.asarray(columns["used"])), "value")
-            raise DomainError(f"stars: column 'used' has {values} for {counted(len(x), 'star')}")
+            flags = counted(len(np.asarray(columns["used"])), "value")
+            raise DomainError(f"stars: column 'used' has {flags} for {counted(len(x), 'star')}")
         if "used" in columns:
             stars = stars.chosen(np.asarray(columns["used"], dtype=bool))
         return stars

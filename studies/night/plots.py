@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import Normalize
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from ...core.number_text import counted
 from ...core.plotting import new_figure, png_bytes, styled
@@ -87,7 +87,7 @@ def _colour_bar(image: QuadMesh, axes: Axes, *, counts: bool) -> None:
     elif highest - lowest <= _ONE_VALUE * abs(highest):
         bar.set_ticks([highest], labels=[f"{highest:.4g}"])
     else:
-        bar.formatter.set_useOffset(False)
+        bar.formatter = ScalarFormatter(useOffset=False)
     bar.update_ticks()
 
 

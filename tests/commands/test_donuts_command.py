@@ -103,6 +103,9 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
     [
         (["missing.fits"], "missing.fits: no such file"),
         (["text.fits"], "text.fits: cannot be read as FITS"),
+        (["a.npy"], "a.npy: array of shape [2, 16] and type float32: expected FITS files of images; pachon.fit_donuts"),
+        (["plain.fits", "--mask", "a.npz"], "a.npz: m of shape [2, 16, 16] and type bool: expected FITS files"),
+        (["object.npy"], "object.npy: no file of plain NumPy arrays: expected FITS files of images"),
         (
             ["plain.fits"],
             "plain.fits: no field angles: expected FIELD_X and FIELD_Y, a table with them, or --field-deg",
@@ -158,6 +161,9 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
 def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, part):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "text.fits").write_text("no FITS at all\n")
+    np.save("a.npy", np.zeros((2, 16), np.float32))
+    np.save("object.npy", np.array([None]))
+    np.savez("a.npz", m=np.zeros((2, 16, 16), bool))
     fits.PrimaryHDU(np.zeros((2, 16, 16))).writeto("plain.fits")
     table = fits.BinTableHDU(Table({"field_x": [0.0], "field_y": [0.0]}))
     fits.HDUList([fits.PrimaryHDU(np.zeros((2, 16, 16))), table]).writeto("rows.fits")
