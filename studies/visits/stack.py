@@ -170,8 +170,9 @@ class PsfStack(Result):
         """
         rows = np.flatnonzero((sums.count > 0) & (2 * sums.count >= sums.visits))
         if (~star[rows]).sum() < 2 or star[rows].sum() < 2:
+            visits = counted(sums.visits, "visit")
             raise DomainError(
-                f"{len(rows)} stars and places were seen by half of {counted(sums.visits, 'visit')}: expected more, or "
+                f"{len(rows)} stars and places were seen by half of {visits}: expected more of them, or "
                 "CCDs around the middle of the field, which all rolls see"
             )
         count = sums.count[rows]
