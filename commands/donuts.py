@@ -78,6 +78,9 @@ def donuts_command(
     work = DonutWork.of(telescope, stamps, frames, fit_options)
     if not telescope.quiet and work.remark:
         print_line(work.remark, error=True)
+    if telescope.defocus_um and work.inputs.defocus.any():
+        of_files = ", ".join(f"{shift:.4g}" for shift in sorted({1e6 * float(shift) for shift in work.inputs.defocus}))
+        print_warning(f"--defocus-um = {telescope.defocus_um:g} is added to the defocus of the files, {of_files} um")
     fit, orientation = _fitted(work, telescope.quiet, orientation_check=fit_options.orientation_check)
     converted = fit.zernikes_in(frames.zernike_convention, frames.names[1], frames=work.frames)
     motions = _hexapod_corrections(fit, frames, work.frames)

@@ -377,18 +377,27 @@ def test_simulations_refuse_all_options_of_fits_and_fits_those_of_simulations(tm
         assert capsys.readouterr().err == f"pachon: error: {option.opts[0]}: {expected}\n"
 
 
+def interrupted(*_, **__):
+    raise KeyboardInterrupt
+
+
 def test_an_interrupted_fit_says_that_nothing_is_written(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     fits.PrimaryHDU(np.zeros((2, 16, 16))).writeto("plain.fits")
-
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
-
     monkeypatch.setattr("pachon.sensing.fit.fit_donuts", interrupted)
     assert main(["donuts", "plain.fits", "--field-deg", "0,1", "--defocus-um", "1500", "-o", "a.ecsv"]) == 130
     error = "pachon: error: interrupted; nothing is written before all donuts are fitted\n"
     assert capsys.readouterr().err == error
     assert not (tmp_path / "a.ecsv").exists()
+
+
+def test_a_defocus_beside_that_of_the_file_is_said(tmp_path, monkeypatch, capsys):
+    """With that of the file given once more, no donut of a simulated file fitted."""
+    monkeypatch.chdir(tmp_path)
+    fits.PrimaryHDU(np.zeros((2, 16, 16)), fits.Header({"DEFOC_UM": 1500.0})).writeto("plain.fits")
+    monkeypatch.setattr("pachon.sensing.fit.fit_donuts", interrupted)
+    assert main(["donuts", "plain.fits", "--field-deg", "0,1", "--defocus-um", "1500"]) == 130
+    assert "--defocus-um = 1500 is added to the defocus of the files, 1500 um\n" in capsys.readouterr().err
 
 
 def test_motions_that_were_not_fitted_are_dashes():
