@@ -9,6 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
+from ..core.number_text import counted
 from ..core.terminal import print_line, print_warning
 from . import completion
 from .choices import names
@@ -115,7 +116,7 @@ def baseline_save(
     if as_json:
         print_json({"baseline": str(out), "figures": len(baseline.figures), "left_out": left_out})
     elif not quiet:
-        print_line(f"{out}: {len(baseline.figures)} metrics of {baseline.model}")
+        print_line(f"{out}: {counted(len(baseline.figures), 'metric')} of {baseline.model}")
 
 
 @baseline_app.command("update")
@@ -141,13 +142,13 @@ def baseline_update(
     if as_json:
         print_json({"baseline": str(path), "updated": [d.name for d in check.moved]})
     elif not quiet:
-        print_line(f"{path}: {len(check.moved)} of {len(check.deviations)} metrics updated")
+        print_line(f"{path}: {len(check.moved)} of {counted(len(check.deviations), 'metric')} updated")
 
 
 def _warn_broken(names: list[str]) -> None:
     """Print a warning for metrics that do not meet their requirements."""
     if names:
-        print_warning(f"{len(names)} metrics are beyond their limits, such as {names[0]}")
+        print_warning(f"{counted(len(names), 'metric is', 'metrics are')} beyond their limits, such as {names[0]}")
 
 
 @app.command("check")

@@ -12,6 +12,7 @@ from typer import Argument
 
 from ..core.errors import ConfigError
 from ..core.file_names import file_name
+from ..core.number_text import counted
 from ..core.terminal import print_line
 from . import completion
 from .choices import names
@@ -19,7 +20,6 @@ from .completion import YAML
 from .inputs import configured_experiment, warnings_shown
 from .options import Json, NoPicture, Picture, Settings, TableFile, picture_kind
 from .tables import Rows, print_json
-from .verdicts import counted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
+from ..core.number_text import counted
 from ..core.terminal import print_line
 from . import completion
 from .choices import names
@@ -114,7 +115,9 @@ def diagnose_command(
     rows.show()
     if result.missing:
         reason = next(iter(result.missing.values()))
-        wide_console().print(f"{len(result.missing)} CCDs are left out; the first: {reason}", style="bold")
+        wide_console().print(
+            f"{counted(len(result.missing), 'CCD is', 'CCDs are')} left out; the first: {reason}", style="bold"
+        )
     print_line(f"diagnostics: {result.folder.resolve()}")
 
 

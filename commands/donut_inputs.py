@@ -10,73 +10,22 @@ from typing import TYPE_CHECKING
 
 from ..core.errors import ConfigError, ProductError
 from .completion import YAML
-from .options import degrees_pair
 
 if TYPE_CHECKING:
     import numpy as np
 
     from ..models.telescope import Telescope
-    from ..raytrace.rays import Projection
-    from ..sensing.frames import DonutFrames, FrameName
+    from ..sensing.frames import DonutFrames
     from ..sensing.stamp_files import DonutStamps
     from ..sensing.stamp_headers import HeaderValues
+    from .donut_options import FrameOptions
 
-#: Frames of field angles and of results.
-FRAME_NAMES = ("OCS", "CCS", "DVCS", "ZCS", "sky")
-#: Telescope where neither option nor header names one.
-DEFAULT_TELESCOPE = "lsst_v3.3_r"
-#: Side of a pixel where neither option nor header says it [um].
-DEFAULT_PIXEL_UM = 10.0
 #: Body that each camera's telescope moves out of focus.
 _MOVED = {"lsst": "Camera", "comcam": "Camera", "auxtel": "M2", "decam": "DECam"}
 #: Names of detectors that stand out of focus themselves: LSST's corner sensors and DECam's focus chips.
 _OUT_OF_FOCUS = re.compile(r"\w+_SW\d|F[NS]\d")
 #: Difference of angles of one exposure that is rounding of its headers [rad].
 _SAME_ANGLE = 1e-3
-
-
-@dataclass(frozen=True)
-class FrameOptions:
-    """Options of frames.
-
-    Attributes
-    ----------
-    rotator_deg, parallactic_deg : float or None
-        Angles in place of those of headers.
-    stamp_axes : str or None
-        Axes of stamps in place of those of headers.
-    field_frame : str
-        Frame of field angles of files and options.
-    field_deg : str or None
-        Field angle of all stamps where files have none.
-    projection : str
-        Meaning of field angles.
-    """
-
-    rotator_deg: float | None
-    parallactic_deg: float | None
-    stamp_axes: str | None
-    field_frame: FrameName
-    field_deg: str | None
-    projection: Projection
-
-    def frames(self, header: HeaderValues) -> DonutFrames:
-        """Return angles and axes, those of headers where no option gives them."""
-        import numpy as np
-
-        from ..sensing.frames import DonutFrames
-
-        if self.field_deg is not None:
-            degrees_pair(self.field_deg, "--field-deg")
-        rotator = header.rotator or 0.0 if self.rotator_deg is None else np.deg2rad(self.rotator_deg)
-        parallactic = header.parallactic_angle if self.parallactic_deg is None else np.deg2rad(self.parallactic_deg)
-        for option, value in (("--rotator-deg", rotator), ("--parallactic-deg", parallactic)):
-            if value is not None and not np.isfinite(value):
-                raise ConfigError(f"{option} = {value}: expected a finite number of degrees")
-        try:
-            return DonutFrames(rotator, parallactic, self.stamp_axes or "x,y")
-        except ConfigError as error:
-            raise error.renamed("--stamp-axes") from None
 
 
 @dataclass(frozen=True)
@@ -179,9 +128,17 @@ class DonutInputs:
 
 
 def donut_inputs(
-    files: StampFiles, options: FrameOptions, frames: DonutFrames, telescope: Telescope, gain: float
+    files: StampFiles,
+    options: FrameOptions,
+    frames: DonutFrames,
+    telescope: Telescope,
+    gain: float,
+    field: np.ndarray | None,
 ) -> DonutInputs:
-    """Return the stamps of files for a telescope with its camera at the angle of the rotator."""
+    """Return the stamps of files for a telescope with its camera at the angle of the rotator.
+
+    Files without field angles have one that is given [rad].
+    """
     import numpy as np
 
     from ..sensing.frames import along_camera, stamp_matrix
@@ -191,8 +148,11 @@ def donut_inputs(
     images, masks, variances, axes = [], [], [], []
     fields, defocus, heights = [], [], []
     for path, stamps in zip(files.paths, files.stamps, strict=True):
-        places = stamp_places(stamps, telescope, path, options.projection) if on_camera(stamps) else None
-        fields.append(_fields(path, stamps, options, frames, None if places is None else places.fields))
+        places = stamp_places(stamps, telescope, path, options.field_projection) if on_camera(stamps) else None
+        if places is not None and stamps.fields is None:
+            fields.append(places.fields)
+        else:
+            fields.append(_fields(path, stamps, options, frames, field))
         nominal = np.zeros(len(stamps)) if places is None else places.heights
         lacking = np.flatnonzero(~stamps.has_defocus & (nominal == 0.0))
         if stamps.has_defocus.any() and lacking.size:
@@ -217,17 +177,15 @@ def donut_inputs(
 
 
 def _fields(
-    path: Path, stamps: DonutStamps, options: FrameOptions, frames: DonutFrames, on_ccds: np.ndarray | None
+    path: Path, stamps: DonutStamps, options: FrameOptions, frames: DonutFrames, field: np.ndarray | None
 ) -> np.ndarray:
-    """Return field angles in the telescope frame: those of the file, of its CCDs, or of the option."""
+    """Return field angles in the telescope frame: those of the file, or the one given for all stamps."""
     import numpy as np
 
-    if stamps.fields is not None:
-        angles = stamps.fields
-    elif on_ccds is not None:
-        return on_ccds
-    elif options.field_deg is not None:
-        angles = np.tile(np.deg2rad(degrees_pair(options.field_deg, "--field-deg")), (len(stamps), 1))
-    else:
-        raise ConfigError("no field angles: expected FIELD_X and FIELD_Y, a table with them, or --field-deg", file=path)
-    return frames.fields_of_telescope(angles, options.field_frame, projection=options.projection)
+    angles = stamps.fields
+    if angles is None:
+        if field is None:
+            text = "no field angles: expected FIELD_X and FIELD_Y, a table with them, or --field-deg"
+            raise ConfigError(text, file=path)
+        angles = np.tile(field, (len(stamps), 1))
+    return frames.fields_of_telescope(angles, options.names[0], projection=options.field_projection)

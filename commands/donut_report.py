@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import degrees
 from typing import TYPE_CHECKING, Any
 
+from ..core.number_text import counted
 from ..core.terminal import print_line
 from .tables import Rows
 
@@ -33,7 +34,8 @@ def orientation_text(check: OrientationCheck, inputs: DonutInputs) -> str:
     if check.best == "-x,-y":
         # Beside the axis the other side of focus is much like a half turn.
         option += ", unless the defocus has the wrong sign"
-    return f"stamps fit better mirrored or turned by quarters, {quality} of {len(check.donuts)} donuts{option}"
+    donuts = counted(len(check.donuts), "donut")
+    return f"stamps fit better mirrored or turned by quarters, {quality} of {donuts}{option}"
 
 
 def observatory_summary(
@@ -162,24 +164,24 @@ def _remarks(fit: DonutFit) -> list[str]:
     from ..sensing.flags import DonutFlag
 
     remarks, exposure = [], fit.exposure
+    donuts_fit = counted(len(fit), "donut fits", "donuts fit")
     wrong, ambiguous = (
         int(sum(bool(flag & bit) for flag in fit.flags)) for bit in (DonutFlag.DEFOCUS_SIGN, DonutFlag.AMBIGUOUS_SIDE)
     )
     if wrong:
         remarks.append(
-            f"{wrong} of {len(fit)} donuts fit the other side of focus: the sign of their defocus is wrong, or their "
-            "stamps are turned or mirrored."
+            f"{wrong} of {donuts_fit} the other side of focus: the sign of the defocus is wrong, or stamps are turned "
+            "or mirrored."
         )
     if ambiguous:
-        remarks.append(
-            f"{ambiguous} of {len(fit)} donuts fit both sides of focus: results are those of the side given."
-        )
+        remarks.append(f"{ambiguous} of {donuts_fit} both sides of focus: results are those of the side given.")
     if len(fit.amplifier_steps):
         remarks.append(f"Steps between amplifiers were fitted too: {'; '.join(step_words(fit.amplifier_steps))}.")
     if exposure is not None:
+        fitted = counted(int(fit.usable.sum()), "donut is", "donuts are")
         remarks.append(
-            f"{int(fit.usable.sum())} donuts are fitted as of one telescope (--each-alone: each by itself). By their "
-            f"scatter the air has {1e9 * exposure.air_rms:.0f} nm rms, which the errors include, and the fits "
+            f"{fitted} fitted as of one telescope (--each-alone: each by itself). By their scatter the air has "
+            f"{1e9 * exposure.air_rms:.0f} nm rms, which the errors include, and the fits "
             f"{exposure.noise_scale:.2g} times the variance that they claim."
         )
         remarks += [notice[0].upper() + notice[1:] + "." for notice in exposure.notices]

@@ -2,41 +2,38 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.errors import ConfigError
+from ..core.number_text import counted
 from ..core.terminal import print_line
 from .interrupt import interruptible
-from .options import degrees_pair, wavelength_list
+from .options import wavelength_list
 
 if TYPE_CHECKING:
-    from ..models.telescope import Telescope
-    from ..sensing.model import DonutModel
+    from .donut_options import SimulationOptions, TelescopeOptions
 
 
-def simulate_file(
-    files: list[Path],
-    believed: tuple[str, Telescope],
-    model: DonutModel,
-    texts: tuple[list[str], list[str]],
-    wavelength_nm: list[float] | None,
-    field_deg: str | None,
-    quiet: bool,
-) -> None:
-    """Write a file of donuts: telescope believed in, by its name and itself, model, texts of its errors and scene."""
-    import numpy as np
-
+def simulate_file(options: TelescopeOptions, simulation: SimulationOptions) -> None:
+    """Write a file of donuts of a telescope."""
     from ..pipeline.simulate.donut_file import DonutScene, changed_telescope, simulate_donuts, write_donuts
+    from ..sensing.model import DETECTOR, DonutAir, DonutDetector, DonutModel
 
-    if len(files) != 1 or files[0].suffix.lower() not in (".fits", ".fit"):
-        raise ConfigError("--simulate: expected one FILE.fits to write", file=files[-1])
-    name, telescope = believed
-    scene, true = DonutScene.of(texts[1]), changed_telescope(telescope, texts[0])
-    model = model.with_light(wavelength_list(telescope, wavelength_nm, None))
-    field = None if field_deg is None else np.deg2rad(degrees_pair(field_deg, "--field-deg"))
-    with interruptible(quiet) as reporter, reporter.stage("donuts"):
-        donuts = simulate_donuts(telescope, true, scene, model, field)
-    write_donuts(files[0], donuts, scene, model, name)
-    if not quiet:
-        print_line(f"{files[0]}: {len(donuts.fields)} donuts, moved: {model.detector.moved}")
+    name, telescope = options.load()
+    if len(options.files) != 1 or options.files[0].suffix.lower() not in (".fits", ".fit"):
+        raise ConfigError("--simulate: expected one FILE.fits to write", file=options.files[-1])
+    scene = DonutScene.of(simulation.settings or [])
+    true = changed_telescope(telescope, simulation.perturb or [])
+    model = DonutModel(
+        air=DonutAir(outer_scale=options.outer_scale_m),
+        detector=DonutDetector(
+            options.pixel_size(None, telescope.camera),
+            defocus=1e-6 * options.defocus_um,
+            moved=options.moved or DETECTOR,
+        ),
+    ).with_light(wavelength_list(telescope, options.wavelength_nm, None))
+    with interruptible(options.quiet) as reporter, reporter.stage("donuts"):
+        donuts = simulate_donuts(telescope, true, scene, model, options.field())
+    write_donuts(options.files[0], donuts, scene, model, name)
+    if not options.quiet:
+        print_line(f"{options.files[0]}: {counted(len(donuts.fields), 'donut')}, moved: {model.detector.moved}")

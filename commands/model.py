@@ -90,7 +90,7 @@ def model_command(
     """
     from ..core.files import write_bytes
     from ..core.plotting import picture_bytes
-    from ..core.table_files import write_table
+    from ..core.table_files import in_format_of, write_table
     from ..core.units import ARCSEC
     from ..models.star_spectrum import psf_colours
     from ..reconstruction.own_stars.own_stars import fit_own_stars
@@ -120,7 +120,8 @@ def model_command(
         picture_path = picture or (None if as_json else path.with_suffix(".png"))
         if picture_path is not None and not no_picture:
             write_bytes(picture_path, picture_bytes(result.plot(stars.name), kind))
-        write_table(table or path.with_suffix(".ecsv"), result.table())
+        table_path = table or path.with_suffix(".ecsv")
+        write_table(table_path, in_format_of(table_path, result.table()))
     summary_of_stars = result.summary()
     if as_json:
         print_json({"model": str(path), **summary_of_stars})

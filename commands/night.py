@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Option
 
 from ..core.errors import ConfigError
-from ..core.number_text import NumberText
+from ..core.number_text import NumberText, counted
 from ..core.terminal import print_line
 from . import completion
 from .choices import names
@@ -124,9 +124,11 @@ def show_night(result: NightResult, out: Path, table: Path | None, *, quiet: boo
         return
     rows.show()
     if result.missing:
-        print_line(f"{len(result.missing)} visits are missing; the last part to end has them all")
+        print_line(
+            f"{counted(len(result.missing), 'visit is', 'visits are')} missing; the last part to end has them all"
+        )
     if result.left_out:
-        print_line(f"{len(result.left_out)} visits are left out, summary.json has the reasons")
+        print_line(f"{counted(len(result.left_out), 'visit is', 'visits are')} left out, summary.json has the reasons")
     print_line(f"night: {out.resolve()}")
     print_line(f"report: {(out / REPORT_NAME).resolve()}")
 

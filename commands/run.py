@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Option
 
+from ..core.number_text import counted
 from ..core.terminal import print_line, print_warning
 from .inputs import configuration, configured_experiment
 from .night import (
@@ -123,7 +124,7 @@ def run_command(
     if result.report:
         write_rows(_ccd_rows(result), table)
     elif table is not None:
-        print_warning(f"{table} is not written: {len(result.missing)} CCDs of other parts are missing")
+        print_warning(f"{table} is not written: {counted(len(result.missing), 'CCD')} of other parts missing")
     if as_json:
         part_summary = {"missing": list(result.missing), "not_modelled": result.not_modelled}
         print_json(result.summary if result.report else part_summary)
@@ -138,7 +139,8 @@ def _show_part(result: RunResult) -> None:
     count = len(result.missing)
     example_names = f"{', '.join(result.missing[:3])}{', ...' if count > 3 else ''}"
     print_line(
-        f"{len(result.computed)} CCDs computed, {len(result.kept)} were there; {count} are missing: {example_names}"
+        f"{counted(len(result.computed), 'CCD')} computed, {len(result.kept)} there already; {count} missing: "
+        f"{example_names}"
     )
     print_line("the last part to end writes the report")
 
@@ -169,7 +171,7 @@ def _show_run(result: RunResult, report: Path, seconds: float) -> None:
     if models:
         console.print()
         Rows(MODELS_COLUMNS, models, MODELS_CAPTION).show()
-    console.print(f"\n{len(result.computed)} CCDs computed, {len(result.kept)} kept, {seconds:.0f} s")
+    console.print(f"\n{counted(len(result.computed), 'CCD')} computed, {len(result.kept)} kept, {seconds:.0f} s")
     if result.not_modelled:
         console.print(f"left out, not to be modelled: {', '.join(result.not_modelled)}", style="bold")
     print_line(f"report: {report.resolve()}")

@@ -128,11 +128,11 @@ class Rows:
         """Write the table: .ecsv, .csv, .fits or .parquet; numbers as numbers, with units and errors of their own."""
         from astropy.table import Table as AstropyTable
 
-        from ..core.table_files import flat_table, write_table
+        from ..core.table_files import in_format_of, name_and_unit, write_table
 
         table = AstropyTable()
         for heading, *cells in zip(self.headings, *self.rows, strict=True):
-            name, unit = _name_and_unit(heading)
+            name, unit = name_and_unit(heading or "name")
             for key, values in _plain_columns(cells).items():
                 is_text = any(isinstance(value, str) for value in values)
                 if path.suffix.lower() == ".fits":
@@ -141,27 +141,13 @@ class Rows:
                 table[column] = values
                 if unit and not is_text:
                     table[column].unit = unit
-        write_table(path, flat_table(table) if path.suffix.lower() in (".csv", ".parquet") else table)
+        write_table(path, in_format_of(path, table))
 
 
 def write_rows(rows: Rows, path: Path | None) -> None:
     """Write a table where it has a path."""
     if path is not None:
         rows.write(path)
-
-
-def _name_and_unit(heading: str) -> tuple[str, Any]:
-    """Return the name and the unit of a heading such as ``rms [nm]``; no unit where astropy has none of that name."""
-    from astropy.units import Unit
-
-    match = re.fullmatch(r"(.*?)\s*\[([^][]+)\](.*)", heading)
-    if match is None:
-        return heading or "name", None
-    try:
-        unit = Unit("arcsec" if match[2] == '"' else match[2])
-    except (ValueError, TypeError):
-        return heading, None
-    return f"{match[1]}{match[3]}".strip() or "value", unit
 
 
 def _plain_columns(cells: list[str]) -> dict[str, Sequence[float] | Sequence[str]]:

@@ -10,6 +10,7 @@ import typer
 from typer import Argument
 
 from ..core.errors import PrescriptionWarning
+from ..core.number_text import counted
 from ..core.terminal import print_line
 from . import completion
 from .choices import choice, names
@@ -135,4 +136,4 @@ def convert_command(
     telescope = load_model(model, lenient, glass_catalogue or (), configuration)
     with warnings_shown(PrescriptionWarning):
         save_telescope(telescope, out, format=cast("LensFormat", format), lenient=lenient)
-    print_line(f"{telescope.name}: {len(telescope.surfaces)} surfaces written to {out}")
+    print_line(f"{telescope.name}: {counted(len(telescope.surfaces), 'surface')} written to {out}")

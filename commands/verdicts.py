@@ -6,13 +6,10 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from ..core.number_text import counted
+
 #: Figures of one stack, of one case or of one image, by name.
 Figures = Mapping[str, Any]
-
-
-def counted(count: int, noun: str, plural: str = "") -> str:
-    """Return a number with its noun: 1 CCD, 2 CCDs."""
-    return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
 
 
 def percent_text(fraction: float) -> str:

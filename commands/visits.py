@@ -246,7 +246,8 @@ def null_test_command(
     by a Gaussian, as in the paper, and by linear functionals without bias. Rings of galaxies under a shear of 0.02 give
     the multiplicative and the additive bias of all. Each galaxy has a stamp of its own; neighbours are left out.
 
-    Tables of galaxies, null_test.json and two pictures go into the folder of the visits.
+    Tables of galaxies, null_test.json and two pictures go into the folder of the visits. A tile takes ten seconds in a
+    stack of one visit, and up to a minute in one of a hundred, which shows more galaxies.
 
     **Examples**
 

@@ -153,7 +153,8 @@ def shown(value: object) -> str:
         # Numbers and quantities of NumPy and astropy without their types.
         return cut_short(str(value), _MAX_VALUE)
     if isinstance(shape, tuple) and getattr(value, "size", 0) > 8:
-        return f"{type(value).__name__} of shape {shape}"
+        kind = getattr(value, "dtype", None)
+        return f"{type(value).__name__} of shape {shape}" + ("" if kind is None else f" and type {kind}")
     return cut_short(" ".join(_REPR.repr(value).split()), _MAX_VALUE)
 
 

@@ -112,6 +112,7 @@ class Execution:
         contents: Iterable[Any],
         *,
         title: str | None = None,
+        sizes: Sequence[int] | None = None,
         folder: Path | None = None,
         product: Callable[[int], Path] | None = None,
         save: Callable[[Any], None] | None = None,
@@ -133,6 +134,8 @@ class Execution:
             Contents of the jobs, made as workers take them.
         title : str, optional
             Title of the progress bar; without one there is none.
+        sizes : sequence of int, optional
+            Items of each job, above zero, that the progress counts; one by default.
         folder : Path, optional
             Folder of the files of all jobs. Those of workers that do not share it are written as they arrive.
         product : callable, optional
@@ -167,7 +170,7 @@ class Execution:
                 title = None if title is None else f"{title}, {job_workers.description}"
             check(job_workers.processes)
             jobs = (Job(i, *job) for i, job in enumerate(zip(labels, contents, strict=True)))
-            with closing(self._ordered(job_workers, jobs, labels, title, store)) as ordered:
+            with closing(self._ordered(job_workers, jobs, labels, title, sizes, store)) as ordered:
                 yield ordered
 
     def _ordered(
@@ -176,22 +179,25 @@ class Execution:
         jobs: Iterator[Job],
         labels: Sequence[str],
         title: str | None,
+        sizes: Sequence[int] | None,
         store: Callable[[JobResult], None],
     ) -> Generator[Any, None, None]:
         """Store results as they arrive, and yield them in the order of the jobs."""
         waiting: dict[int, Any] = {}
-        due = 0
+        due = items_done = 0
         lines_apart = max(1, len(labels) // _MOST_LINES)
+        sizes = [1] * len(labels) if sizes is None else sizes
         with (
-            nullcontext() if title is None else self.reporter.stage(title, total=len(labels)) as stage,
+            nullcontext() if title is None else self.reporter.stage(title, total=sum(sizes)) as stage,
             closing(job_workers.results(jobs)) as arriving,
         ):
             for done, result in enumerate(arriving, start=1):
                 store(result)
+                items_done += sizes[result.number]
                 if stage is not None:
-                    stage.advance()
+                    stage.advance(sizes[result.number])
                     if done % lines_apart == 0:
-                        stage.step(labels[result.number], done, len(labels))
+                        stage.step(labels[result.number], items_done, sum(sizes))
                 waiting[result.number] = result.value
                 while due in waiting:
                     yield waiting.pop(due)

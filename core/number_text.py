@@ -1,9 +1,14 @@
-"""Texts of numbers in tables, with the numbers in full behind them."""
+"""Texts of numbers: with nouns, and in tables, with the numbers in full behind them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+
+
+def counted(count: int, noun: str, plural: str = "") -> str:
+    """Return a number with its noun: 1 CCD, 2 CCDs."""
+    return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
 
 
 class CellText(str):

@@ -118,13 +118,10 @@ class Result:
         ProductError
             If it cannot be written.
         """
-        from .table_files import flat_table, write_table
+        from .table_files import in_format_of, write_table
 
-        table = self.to_table()
-        if Path(path).suffix.lower() in (".csv", ".parquet"):
-            table = flat_table(table)
         images = {name: (np.asarray(getattr(self, name)), *self._described(name)) for name in self._images}
-        write_table(Path(path), table, images, self._image_cards())
+        write_table(Path(path), in_format_of(Path(path), self.to_table()), images, self._image_cards())
 
     def _repr_html_(self) -> str:
         """Return the first rows of the table and the picture, as notebooks show them."""

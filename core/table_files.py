@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import io
+import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from astropy import units as u
 from astropy.io import fits
 from astropy.table import Column, Table
 from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
@@ -24,12 +26,16 @@ FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits", ".parque
 ENDINGS = (*FORMATS, ".fit")
 # Of columns in CSV files; the first where a file has one column.
 _DELIMITERS = ",;\t"
+# Headings such as "rms [nm]".
+_HEADING = re.compile(r"(.*?)\s*\[([^][]+)\](.*)")
 #: Values, unit in FITS notation and description.
 Described = tuple[np.ndarray, str, str]
 
 
 def read_columns(path: Path) -> dict[str, Column | np.ndarray]:
     """Return the columns of a file, of FITS its first table, by their names in small letters.
+
+    Names with units, of CSV and Parquet, stand for their columns beside the names alone, whose columns have the units.
 
     Raises
     ------
@@ -46,7 +52,11 @@ def read_columns(path: Path) -> dict[str, Column | np.ndarray]:
         with parsing(path, f"damaged or no {kind.removeprefix('ascii.').upper()} table", ProductError):
             if kind == "parquet":
                 content = parquet_module(path, ProductError).read_table(io.BytesIO(data))
-                return {name.lower(): content[name].to_numpy() for name in content.column_names}
+                columns = {name.lower(): content[name].to_numpy() for name in content.column_names}
+                return columns | {
+                    name: Column(columns[heading], unit=unit)
+                    for name, (heading, unit) in _names_in_headings(columns).items()
+                }
             table = Table.read(io.BytesIO(data), format=kind) if kind == "fits" else text_table(data, kind)
     return {name.lower(): table[name] for name in table.colnames}
 
@@ -54,7 +64,8 @@ def read_columns(path: Path) -> dict[str, Column | np.ndarray]:
 def text_table(data: bytes, kind: str = "ascii.csv") -> Table:
     """Return the table of a file of CSV or ECSV; numbers that a CSV file leaves out are masked.
 
-    CSV files are also those of spreadsheets, with a byte order mark, comments, semicolons or tabs for commas.
+    CSV files are also those of spreadsheets, with a byte order mark, comments, semicolons or tabs for commas. A column
+    ``x [mm]`` of theirs has a copy ``x`` with the unit, unless there is one.
     """
     lines = text_lines(data.decode("utf-8-sig"))
     if kind == "ascii.ecsv" or (lines and lines[0].startswith("# %ECSV")):
@@ -62,7 +73,35 @@ def text_table(data: bytes, kind: str = "ascii.csv") -> Table:
     head = next((line for line in lines if line.strip() and not line.startswith("#")), None)
     if head is None:
         return Table()
-    return Table.read(lines, format=kind, delimiter=max(_DELIMITERS, key=head.count), comment=r"\s*#")
+    table = Table.read(lines, format=kind, delimiter=max(_DELIMITERS, key=head.count), comment=r"\s*#")
+    for name, (heading, unit) in _names_in_headings(table.colnames).items():
+        table[name] = table[heading]
+        table[name].unit = unit
+    return table
+
+
+def name_and_unit(heading: str) -> tuple[str, u.UnitBase | None]:
+    """Return the name and the unit of a heading such as ``rms [nm]``; no unit where astropy has none of that name."""
+    match = _HEADING.fullmatch(heading)
+    if match is None:
+        return heading, None
+    try:
+        unit = u.Unit("arcsec" if match[2] == '"' else match[2])
+    except (ValueError, TypeError):
+        return heading, None
+    return f"{match[1]}{match[3]}".strip() or "value", unit
+
+
+def _names_in_headings(headings: Collection[str]) -> dict[str, tuple[str, u.UnitBase]]:
+    """Return headings that have units, and these, by the names before them that no other column has."""
+    names = [heading.partition("[")[0].strip() for heading in headings]
+    named = {heading: name_and_unit(heading) for heading in headings}
+    return {
+        name: (heading, unit)
+        for heading, (name, unit) in named.items()
+        # Pure numbers in brackets count columns: "flux [1]", "flux [2]".
+        if unit is not None and unit.physical_type != "dimensionless" and names.count(name) == 1
+    }
 
 
 def parquet_module(path: Path, error: type[PachonError]) -> Any:
@@ -147,12 +186,17 @@ def parquet_bytes(
     return data.getvalue()
 
 
+def in_format_of(path: Path, table: Table) -> Table:
+    """Return a table as the format of a file holds it: in CSV and Parquet units stand in the names of columns."""
+    return flat_table(table) if path.suffix.lower() in (".csv", ".parquet") else table
+
+
 def flat_table(table: Table) -> Table:
     """Return a table as CSV and Parquet hold it: one number or text a cell, units in the names of columns."""
     flat = Table()
     for name in table.colnames:
         column = table[name]
-        unit = f" [{column.unit}]" if getattr(column, "unit", None) else ""
+        unit = f" [{text}]" if (text := str(getattr(column, "unit", None) or "")) else ""
         values = np.asarray(column)
         if values.ndim == 1:
             flat[name + unit] = values

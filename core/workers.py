@@ -21,6 +21,7 @@ from typing import Any
 
 from .arguments import check_arguments
 from .errors import ProductError
+from .number_text import counted
 from .threads import thread_count
 from .units import require_count
 
@@ -57,7 +58,7 @@ MakeWorkers = Callable[[Compute], Workers]
 def serial_worker(compute: Compute, threads: int | None = None) -> Workers:
     """Return this process as the only worker, with all processors or a number of threads."""
     count = thread_count(threads)
-    return Workers(f"this process, {count} threads", 1, lambda jobs: (compute(job, count) for job in jobs))
+    return Workers(f"this process, {counted(count, 'thread')}", 1, lambda jobs: (compute(job, count) for job in jobs))
 
 
 @check_arguments
@@ -109,7 +110,7 @@ def process_workers(compute: Compute, count: int, threads: int | None = None) ->
                 pool.shutdown(wait=True, cancel_futures=True)
 
     return Workers(
-        f"{count} processes of {threads_per_process} thread{'s' * (threads_per_process > 1)}", count, results
+        f"{counted(count, 'process', 'processes')} of {counted(threads_per_process, 'thread')}", count, results
     )
 
 

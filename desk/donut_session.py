@@ -5,6 +5,7 @@ from __future__ import annotations
 from bokeh.document import Document
 from bokeh.models import Select, Spinner
 
+from ..core.number_text import counted
 from .donut_views import DonutBench
 from .page_session import PageSession
 from .result_pictures import BarsPicture, PlacesPicture, RowsPicture
@@ -15,7 +16,7 @@ class DonutSession(PageSession):
     """The desk of wavefronts of donuts on one page."""
 
     def __init__(self, bench: DonutBench, document: Document | None = None) -> None:
-        super().__init__(f"{bench.name}: desk of donuts", f"{len(bench)} donuts", document)
+        super().__init__(f"{bench.name}: desk of donuts", counted(len(bench), "donut"), document)
         self.bench, self.donut, self.noll = bench, 0, int(bench.noll[0])
         self.field = PlacesPicture("field", ("field x [deg]", "field y [deg]"), self._choose)
         self.bars = BarsPicture("zernikes", "Noll index", "coefficient [nm]")

@@ -6,6 +6,7 @@ import numpy as np
 from bokeh.document import Document
 from bokeh.models import Select
 
+from ..core.number_text import counted
 from .focal_views import MAPS, FocalBench
 from .page_session import PageSession
 from .pictures import BACKGROUNDS, WhiskersPicture
@@ -24,7 +25,7 @@ class FocalSession(PageSession):
 
     def __init__(self, bench: FocalBench, document: Document | None = None) -> None:
         ccds = len(np.unique(bench.ccd))
-        super().__init__(f"{bench.name}: desk of a focal-plane model", f"{ccds} CCDs with stars", document)
+        super().__init__(f"{bench.name}: desk of a focal-plane model", f"{counted(ccds, 'CCD')} with stars", document)
         self.bench, self.place = bench, 0
         self.heights = bench.heights()
         x, y = (1e3 * bench.center).tolist()

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import DomainError
+from ..core.number_text import counted
 from ..core.statistics import FWHM_PER_RMS, finite_median
 from ..core.units import ARCSEC
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
@@ -73,7 +74,8 @@ class FocalBench:
         shapes, _ = self.predicted
         x_mm, y_mm = 1e3 * self.places.T
         fwhm = FWHM_PER_RMS * shapes.size / ARCSEC
-        return WhiskersView(x_mm, y_mm, shapes.e1, shapes.e2, fwhm, f"Predicted shapes at {len(self)} places")
+        title = f"Predicted shapes at {counted(len(self), 'place')}"
+        return WhiskersView(x_mm, y_mm, shapes.e1, shapes.e2, fwhm, title)
 
     def heights(self) -> HeightsView | None:
         """Return the fitted heights of the CCDs; None without a telescope."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.arguments import check_arguments
-from ..core.errors import ConfigError, DomainError
+from ..core.errors import ConfigError, DomainError, ProductError
 from ..design.tolerancing.monte_carlo import MonteCarlo
 from ..models.telescope import Telescope
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 #: Height of a desk in a notebook [pixels].
 _HEIGHT = 860
+#: Ending of the stores of sweeps, which no telescope has.
+_SWEEP = ".sweep"
 
 
 class Desk:
@@ -148,6 +150,8 @@ def open_desk(
             return Desk(*points_page(SweepBench(path)))
         if is_table(path):
             return Desk(*table_page(path))
+        if path.suffix == _SWEEP and not path.exists():
+            raise ProductError("no such file", file=path)
     if isinstance(source, Telescope) or not is_state_file(Path(source)):
         bench = Bench(source if isinstance(source, Telescope) else os.fspath(source))
         state = bench.start

@@ -12,6 +12,7 @@ from bokeh.models import BoxAnnotation, Button, RangeSlider, Select
 from bokeh.models.tools import BoxSelectTool
 
 from ..core.errors import PachonError
+from ..core.number_text import counted
 from .page_session import PageSession
 from .pictures import ORANGE, Picture, WhiskersPicture
 from .result_pictures import CorrelationPicture, RowsPicture
@@ -31,7 +32,7 @@ class RunSession(PageSession):
     """The desk of a run on one page."""
 
     def __init__(self, bench: RunBench, document: Document | None = None) -> None:
-        super().__init__(f"{bench.folder.resolve().name}: desk of a run", f"{len(bench.ccds)} CCDs", document)
+        super().__init__(f"{bench.folder.resolve().name}: desk of a run", counted(len(bench.ccds), "CCD"), document)
         self.bench, self.state = bench, bench.start
         low, high = bench.centers_mm.min(axis=0), bench.centers_mm.max(axis=0)
         extent, (x, y) = 0.5 * float((high - low).max()) + _CCD, (0.5 * (low + high)).tolist()

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import DomainError, ProductError, unknown_name
+from ..core.number_text import counted
 from ..core.statistics import FWHM_PER_RMS, finite_median, rms
 from ..core.units import ARCSEC
 from ..measure.correlation import Correlation, SeparationBins, shear_correlation
@@ -135,7 +136,7 @@ def run_whiskers(bench: RunBench, state: RunState) -> WhiskersView:
     """Return the adaptive moments of the selected stars at their places; sizes as FWHM of those Gaussians."""
     x, y, g1, g2, sigma = _columns(bench, state, "x", "y", "g1", "g2", "sigma")
     good = np.isfinite(g1) & np.isfinite(g2)
-    title = f"Whiskers, {state.kind}: adaptive moments of {np.count_nonzero(good)} stars"
+    title = f"Whiskers, {state.kind}: adaptive moments of {counted(int(np.count_nonzero(good)), 'star')}"
     fwhm = FWHM_PER_RMS * sigma[good] / ARCSEC
     return WhiskersView(1e3 * x[good], 1e3 * y[good], g1[good], g2[good], fwhm, title)
 
@@ -145,7 +146,8 @@ def run_correlation(bench: RunBench, state: RunState) -> Correlation:
     x, y, g1, g2 = _columns(bench, state, "field_x", "field_y", "g1", "g2")
     good = np.isfinite(g1) & np.isfinite(g2)
     if np.count_nonzero(good) < _FEWEST:
-        raise DomainError(f"{np.count_nonzero(good)} stars are selected: expected {_FEWEST} for a correlation")
+        stars = counted(int(np.count_nonzero(good)), "star is", "stars are")
+        raise DomainError(f"{stars} selected: expected {_FEWEST} for a correlation")
     longest = max(float(np.hypot(np.ptp(x[good]), np.ptp(y[good]))), 4.0 * _SHORTEST)
     bins = SeparationBins(_SHORTEST, longest, _BINS)
     return shear_correlation(x[good], y[good], g1[good], g2[good], bins=bins)
@@ -175,7 +177,7 @@ def run_stamps(bench: RunBench, state: RunState) -> RowsView:
         "model": model_row / peak,
         "star - model": (star_row - model_row) / peak,
     }
-    title = f"{state.ccd}: the first {len(shown)} stars of the selection"
+    title = f"{state.ccd}: the first {counted(len(shown), 'star')} of the selection"
     return RowsView(rows, side * product.pixel_scale / ARCSEC, title)
 
 

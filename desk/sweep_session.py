@@ -11,6 +11,7 @@ from bokeh.models.tools import BoxSelectTool, TapTool
 from bokeh.transform import dodge
 
 from ..core.errors import PachonError
+from ..core.number_text import counted
 from .page_session import PageSession
 from .pictures import BLUE, GREEN, GREY, ORANGE, Picture
 from .sweep_views import PointsBench, TornadoView
@@ -78,7 +79,8 @@ class SweepSession(PageSession):
 
     def __init__(self, bench: PointsBench, document: Document | None = None, message: str = "") -> None:
         count = len(bench.number)
-        parts = f"{count} points, {len(bench.parameters)} parameters, {len(bench.metrics)} metrics"
+        counts = {"point": count, "parameter": len(bench.parameters), "metric": len(bench.metrics)}
+        parts = ", ".join(counted(number, noun) for noun, number in counts.items())
         super().__init__(f"{bench.name}: desk of {bench.what}", parts, document)
         self.bench = bench
         self.metric = next(iter(bench.metrics))

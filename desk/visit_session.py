@@ -10,6 +10,7 @@ from bokeh.document import Document
 from bokeh.models import HoverTool, Select
 
 from ..core.errors import PachonError
+from ..core.number_text import counted
 from .page_session import PageSession
 from .pictures import WhiskersPicture
 from .result_pictures import CorrelationPicture, PlacesPicture, SkyMapPicture, as_sky
@@ -22,7 +23,8 @@ class NightSession(PageSession):
 
     def __init__(self, bench: NightBench, document: Document | None = None) -> None:
         name = bench.folder.resolve().name
-        super().__init__(f"{name}: desk of visits", f"{len(bench.visits)} visits in {', '.join(bench.bands)}", document)
+        visits = counted(len(bench.visits), "visit")
+        super().__init__(f"{name}: desk of visits", f"{visits} in {', '.join(bench.bands)}", document)
         self.bench, self.state = bench, bench.start
         self.sky = PlacesPicture("sky", ("right ascension [deg]", "declination [deg]"), lambda row: None, size=14)
         as_sky(self.sky, bench.center[1])
@@ -115,7 +117,7 @@ class StackSession(PageSession):
     @property
     def state_words(self) -> str:
         """What is shown, in words."""
-        return f"{self.bench.folder.resolve().name}: {self.visits} visits, {self.kind}"
+        return f"{self.bench.folder.resolve().name}: {counted(int(self.visits), 'visit')}, {self.kind}"
 
     def change(self, name: str, value: str) -> None:
         """Show another stack, or other shapes."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..core.errors import ProductError, unknown_name
 from ..core.files import parsing
+from ..core.number_text import counted
 from ..core.statistics import FWHM_PER_RMS, finite_median, rms
 from ..core.units import ARCMIN, ARCSEC
 from ..measure.correlation import Correlation
@@ -103,7 +104,8 @@ class NightBench:
         ra, dec, value = (
             np.concatenate([product.detectors[name] for product in products]) for name in ("ra", "dec", state.column)
         )
-        what = f"{len(products)} visits" if state.visit == ALL else f"visit {state.visit}, {products[0].band}"
+        count = counted(len(products), "visit")
+        what = count if state.visit == ALL else f"visit {state.visit}, {products[0].band}"
         return PlacesView(self._near(ra), dec, value, self.label(state.column), f"{state.column} on the sky, {what}")
 
     def map(self, name: str) -> SkyMapView:
@@ -194,7 +196,7 @@ class StackBench:
         size = {STACK_KINDS[0]: stack.size, STACK_KINDS[1]: stack.model_size}.get(kind, stack.size - stack.model_size)
         good = np.isfinite(g1) & np.isfinite(g2)
         fwhm = FWHM_PER_RMS * size[good] / ARCSEC
-        title = f"Stack of {visits} visits, {kind}: {np.count_nonzero(good)} points"
+        title = f"Stack of {counted(int(visits), 'visit')}, {kind}: {counted(int(np.count_nonzero(good)), 'point')}"
         return WhiskersView(stack.x[good] / ARCMIN, stack.y[good] / ARCMIN, g1[good], g2[good], fwhm, title)
 
     def correlation(self, visits: str, kind: str) -> Correlation:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import ConfigError
+from ..core.number_text import counted
 from ..core.progress import Reporter
 from ..models.telescope import Telescope
 from ..pipeline.focal_plane_stage import fit_focal_plane_model
@@ -56,7 +57,7 @@ def fit_exposure_psf(
         raise ConfigError(f"no {config} for the focal-plane model; expected a telescope", key="telescope")
     experiment = None if telescope is not None else load_images_configuration(config).experiment(config.parent)
     weight: dict[str, Any] = {} if experiment is None else {"weight_fwhm": experiment.weight_fwhm}
-    with reporter.stage(f"stars of {len(paths)} images", total=len(paths)) as stage:
+    with reporter.stage(f"stars of {counted(len(paths), 'image')}", total=len(paths)) as stage:
 
         def images() -> Iterator[CcdImage]:
             for number, path in enumerate(paths, start=1):

@@ -15,6 +15,7 @@ from astropy.wcs import WCS
 from ..core.arguments import check_arguments
 from ..core.docstrings import Description
 from ..core.errors import ProductError
+from ..core.number_text import counted
 from ..core.plotting import axes_at, plain_text, styled
 from ..core.products import Columns, Stamp, column, read_fits, table_hdu, write_fits
 from ..core.result import Result
@@ -95,7 +96,7 @@ class CcdImage(Result):
 
     def _label(self) -> str:
         ny, nx = self.image.shape
-        return f"{self.name}, {nx} x {ny} pixels, {len(self.objects.get('X', ()))} objects"
+        return f"{self.name}, {nx} x {ny} pixels, {counted(len(self.objects.get('X', ())), 'object')}"
 
     def _columns(self) -> dict[str, Any]:
         return {name: self.objects.get(name, np.empty(0)) for name in OBJECT_COLUMNS}

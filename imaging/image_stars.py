@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, PachonError
+from ..core.number_text import counted
 from ..core.statistics import RMS_PER_MAD
 from ..core.units import ARCSEC, positive_angle
 from ..measure.catalogue.detect import detect_objects
@@ -82,7 +83,7 @@ def few_or_many_stars(
         raise error.within(subject=f"CCD {image.name}") from None
     if len(stars) < FEWEST_STARS:
         raise DomainError(
-            f"{len(stars)} stars are good: expected at least {FEWEST_STARS} for a PSF, {_HINT}",
+            f"{counted(len(stars), 'star is', 'stars are')} good: expected at least {FEWEST_STARS} for a PSF, {_HINT}",
             subject=f"CCD {image.name}",
         )
     return stars
@@ -188,7 +189,7 @@ def few_stars_warning(stars: StarSelection) -> str:
     count = e.shape[1]
     error = float(np.sqrt((e.var(axis=1, ddof=1)).mean() / count)) if count > 1 else np.nan
     return (
-        f"its PSF comes from {len(stars)} stars: weighted e good to {error:.1g} a component; "
+        f"its PSF comes from {counted(len(stars), 'star')}: weighted e good to {error:.1g} a component; "
         "a catalogue of stars (stars) or a PSF model (psf) makes it better"
     )
 

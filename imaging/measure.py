@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments, removed_arguments
 from ..core.errors import ConfigError, DomainError
+from ..core.number_text import counted
 from ..core.plotting import BLUE, ORANGE, axes_at, styled
 from ..core.products import Columns, described_table
 from ..core.result import Result
@@ -107,7 +108,8 @@ class ImageCatalogue(Result):
 
     def _label(self) -> str:
         count, stars = len(self.objects), len(self.stars)
-        return f"{self.image.name}, {count} objects, {stars} stars, {int(self.usable.sum())} usable galaxies"
+        galaxies = counted(int(self.usable.sum()), "usable galaxy", "usable galaxies")
+        return f"{self.image.name}, {counted(count, 'object')}, {counted(stars, 'star')}, {galaxies}"
 
     def _summary(self) -> dict[str, Any]:
         return self.metrics()

@@ -16,6 +16,7 @@ from ..core.errors import ConfigError, DomainError, ProductError
 from ..core.files import content_hash, write_bytes
 from ..core.long_work import Execution
 from ..core.memory import require_bytes
+from ..core.number_text import counted
 from ..core.products import read_fits, write_fits
 from ..core.version import VERSION
 from ..pipeline.config import digest
@@ -269,8 +270,8 @@ def measure_files(
         measure,
         list(due),
         due.values(),
-        title=f"objects of {len(due)} images",
-        check=lambda count: require_bytes(count * _PIXEL_SIZES * size, f"{count} images at a time"),
+        title=f"objects of {counted(len(due), 'image')}",
+        check=lambda count: require_bytes(count * _PIXEL_SIZES * size, f"{counted(count, 'image')} at a time"),
     ) as results:
         for name, result in zip(due, results, strict=True):
             if isinstance(result, str):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.collections import EllipseCollection
 
+from ..core.number_text import counted
 from ..core.plotting import BLUE, ORANGE, new_figure, png_bytes, styled
 from .image_psf import psfs_on
 from .measure import ImageCatalogue
@@ -66,7 +67,8 @@ def _draw_objects(axes: Axes, catalogue: ImageCatalogue) -> None:
                 linewidths=0.8,
             )
         )
-    title = f"{image.name}: {len(catalogue.stars)} stars, {int(catalogue.usable.sum())} usable galaxies"
+    galaxies = counted(int(catalogue.usable.sum()), "usable galaxy", "usable galaxies")
+    title = f"{image.name}: {counted(len(catalogue.stars), 'star')}, {galaxies}"
     axes.set_title(title, loc="left")
 
 

@@ -11,6 +11,7 @@ from ..core.arguments import check_arguments
 from ..core.errors import ProductError
 from ..core.long_work import Execution, claim_folder
 from ..core.memory import require_bytes
+from ..core.number_text import counted
 from ..core.yaml_reader import read_mapping
 from ..pipeline.experiment import Experiment
 from ..pipeline.memory import check_memory, needed_bytes
@@ -91,7 +92,7 @@ def simulate_images(
                 draw,
                 [f"CCD {name}" for name in unfinished_ccds],
                 unfinished_ccds,
-                title=f"images of {len(unfinished_ccds)} CCDs",
+                title=f"images of {counted(len(unfinished_ccds), 'CCD')}",
                 folder=folder,
                 product=lambda number: paths[unfinished_ccds[number]],
                 check=lambda processes: check_memory(experiment, threads if alone else 1, copies=processes),

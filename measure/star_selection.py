@@ -11,6 +11,7 @@ from scipy import fft, ndimage
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
+from ..core.number_text import counted
 from ..core.statistics import median_image, row_medians
 from ..core.units import pure_numbers, real_array
 from .masked_moments import MOST_MASKED
@@ -83,7 +84,7 @@ def require_stars(good: np.ndarray, flags: np.ndarray, least: int, reason: str =
     if good_count < least:
         defect_text = ", ".join(text for text in (_defect_counts(flags), reason) if text)
         counts = f" ({defect_text})" if defect_text else ""
-        raise DomainError(f"{good_count} of {len(good)} stars left{counts}: expected at least {least}")
+        raise DomainError(f"{good_count} of {counted(len(good), 'star')} left{counts}: expected at least {least}")
 
 
 def _defect_counts(flags: np.ndarray) -> str:
@@ -153,7 +154,8 @@ def flag_stars(
     usable = np.isfinite(total) & (total > 0.0)
     flags[~usable] = StarFlag.UNUSABLE
     if usable.sum() < _FEWEST:
-        raise DomainError(f"{int(usable.sum())} of {count} stars are usable: expected at least {_FEWEST} to compare")
+        stars = counted(count, "star is", "stars are")
+        raise DomainError(f"{int(usable.sum())} of {stars} usable: expected at least {_FEWEST} to compare")
     star = _median_star(images[usable])
     peak = star.max()
     wings, core = (star > _WINGS[0] * peak) & (star < _WINGS[1] * peak), star > _CORE * peak

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, PrescriptionError, unknown_name
 from ..core.notebook import Pictured
+from ..core.number_text import counted
 from ..core.units import broadcast_together, metres, radians
 from .coating import AnyCoating
 from .design_data import DesignData
@@ -179,7 +180,7 @@ class Telescope(Pictured):
 
     def __repr__(self) -> str:
         size, field = f"{self.pupil_diameter:.6g} m", f"{math.degrees(self.field_radius):.6g} deg"
-        return f"<Telescope {self.name}: {len(self.surfaces)} surfaces, pupil {size}, field radius {field}>"
+        return f"<Telescope {self.name}: {counted(len(self.surfaces), 'surface')}, pupil {size}, field radius {field}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A mapping proxy cannot be pickled: hand over plain dictionaries.

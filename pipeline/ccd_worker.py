@@ -11,6 +11,7 @@ from pathlib import Path
 
 from ..core.errors import ProductError
 from ..core.long_work import Execution
+from ..core.number_text import counted
 from .experiment import Experiment
 from .memory import check_memory
 from .run_folder import write_ccds
@@ -42,7 +43,7 @@ def compute_ccds(
         partial(compute_ccd, experiment),
         [f"CCD {name}" for name in names],
         names,
-        title=f"PSFs of {len(names)} CCDs",
+        title=f"PSFs of {counted(len(names), 'CCD')}",
         folder=folder,
         check=lambda processes: check_memory(experiment, 1, copies=processes),
     ) as results:

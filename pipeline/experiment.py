@@ -16,6 +16,7 @@ import numpy as np
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, PachonError, PrescriptionError, error_context
 from ..core.files import read_bytes
+from ..core.number_text import counted
 from ..core.progress import Reporter
 from ..core.random_streams import stream
 from ..core.units import ARCSEC
@@ -270,7 +271,7 @@ class Experiment:
         try:
             if self.screen_kinds:
                 reporter = Reporter(quiet=True) if reporter is None else reporter
-                with reporter.stage(f"atmosphere: {self.atmosphere.layer_count} screens"):
+                with reporter.stage(f"atmosphere: {counted(self.atmosphere.layer_count, 'screen')}"):
                     self.make_screens(threads)
             yield
         finally:

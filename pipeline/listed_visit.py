@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import ConfigError, PachonError, error_context
+from ..core.number_text import counted
 from ..core.products import Card
 from ..models.camera.camera import Camera
 from ..models.io.bundled import BUNDLED
@@ -134,7 +135,7 @@ def check_bands(config: Configuration, visits: VisitList, folder: Path | None = 
                 errors.append(error)
         else:
             if not _has_band(config, str(band), folder):
-                raise errors[0].within(subject=f"band {band}, {len(of_band)} visits of {visits.source}")
+                raise errors[0].within(subject=f"band {band}, {counted(len(of_band), 'visit')} of {visits.source}")
 
 
 def _has_band(config: Configuration, band: str, folder: Path | None) -> bool:

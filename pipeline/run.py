@@ -13,6 +13,7 @@ from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.files import write_bytes, write_json
 from ..core.long_work import Execution
+from ..core.number_text import counted
 from ..core.progress import Reporter
 from ..core.second_process import Submit, second_process
 from ..core.threads import thread_count
@@ -102,7 +103,8 @@ def run(
     names = experiment.config.ccds or ()
     number, parts = part
     if not 1 <= number <= parts <= len(names):
-        raise DomainError(f"part = {number}/{parts}: expected i/n with i from 1 to n, and n at most {len(names)} CCDs")
+        most = counted(len(names), "CCD")
+        raise DomainError(f"part = {number}/{parts}: expected i/n with i from 1 to n, and n at most {most}")
     # Before the screens, which take longer than all of the checks.
     check_catalogue(experiment, names, strict=strict)
     if parts > 1:
@@ -117,7 +119,7 @@ def run(
         if experiment.star_list is not None:
             reporter.line(experiment.star_list.text)
         if finished_names:
-            reporter.line(f"{len(finished_names)} of {len(names)} CCDs are finished already")
+            reporter.line(f"{len(finished_names)} of {counted(len(names), 'CCD is', 'CCDs are')} finished already")
         focal_plane = submit(write_focal_plane, experiment, folder)
         submit(_load_plots)
         failed: dict[str, str] = {}
@@ -150,7 +152,7 @@ def _summarize(
     names = [name for name in experiment.config.ccds or () if name not in failed]
     if not names:
         name, reason = next(iter(failed.items()))
-        raise DomainError(f"none of {len(failed)} CCDs can be modelled; CCD {name}: {reason}")
+        raise DomainError(f"none of {counted(len(failed), 'CCD')} can be modelled; CCD {name}: {reason}")
     with reporter.stage("products"):
         stamp = stamp_of(experiment)
         # Plots and metrics need no noise-free PSF again, and 189 CCDs of 800 are half a gigabyte.

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError
+from ..core.number_text import counted
 from ..core.point_plots import draw_points
 from ..core.result import Result
 from ..core.units import broadcast_together, metres, radians
@@ -120,7 +121,7 @@ class Rays(Result):
         return draw_points(ax, self.position[:, 0], self.position[:, 1], ("x [m]", "y [m]"), equal=True)
 
     def _label(self) -> str:
-        return f"{len(self)} rays, {self.wavelength * 1e9:.5g} nm"
+        return f"{counted(len(self), 'ray')}, {self.wavelength * 1e9:.5g} nm"
 
     def __post_init__(self) -> None:
         # Kernels read as many rays as there are path lengths, whatever the length of the others.

@@ -10,6 +10,7 @@ import numpy as np
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError
 from ..core.launch import launch
+from ..core.number_text import counted
 from ..core.plotting import BLUE, axes_at, plain_text, styled
 from ..core.result import Result
 from ..core.threads import thread_count
@@ -67,7 +68,7 @@ class TraceResult(Result):
         return {**self.__dict__, "_packets": None}
 
     def _label(self) -> str:
-        return f"{len(self.status)} rays at {self.surface}, {int(self.vignetted.sum())} without light"
+        return f"{counted(len(self.status), 'ray')} at {self.surface}, {int(self.vignetted.sum())} without light"
 
     def _columns(self) -> dict[str, Any]:
         return super()._columns() | ({} if self.ccd is None else {"ccd": self.ccd})

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from ..core.number_text import counted
 from ..core.plotting import BLUE, figure_at, styled
 from ..core.result import Result
 from ..design.metrics.field_zernikes import name_terms
@@ -53,7 +54,7 @@ class ExposureWavefront(Result):
     notices: tuple[str, ...]
 
     def _label(self) -> str:
-        return f"{len(self.total)} donuts, air {1e9 * self.air_rms:.0f} nm rms"
+        return f"{counted(len(self.total), 'donut')}, air {1e9 * self.air_rms:.0f} nm rms"
 
     def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit, of plain numbers and lists."""

@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError
+from ..core.number_text import counted
 from ..core.plotting import axes_at, plain_text, styled
 from ..core.result import Result
 from ..core.units import ARCSEC, length
@@ -126,7 +127,8 @@ class ObservatoryZernikes(Result):
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     def _label(self) -> str:
-        return f"{len(self.values)} donuts, Zernikes {self.noll[0]} to {self.noll[-1]}, {self.convention}, {self.frame}"
+        terms = f"Zernikes {self.noll[0]} to {self.noll[-1]}"
+        return f"{counted(len(self.values), 'donut')}, {terms}, {self.convention}, {self.frame}"
 
     def to_table(self) -> QTable:
         """Return one row a donut: field angles, and Zernikes with their errors, in the convention's unit."""

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
+from ..core.number_text import counted
 from ..core.plotting import BLUE, axes_at, styled
 from ..core.result import Result
 from ..core.threads import one_blas_thread, thread_count
@@ -115,7 +116,7 @@ class OrientationCheck(Result):
 
     def _label(self) -> str:
         state = "another fits better" if self.doubtful else "confirmed" if self.decided else "not decided"
-        return f"orientation of stamps: {state}, best {self.best}, {len(self.donuts)} donuts"
+        return f"orientation of stamps: {state}, best {self.best}, {counted(len(self.donuts), 'donut')}"
 
 
 @check_arguments

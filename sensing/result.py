@@ -9,6 +9,7 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 
+from ..core.number_text import counted
 from ..core.plotting import figure_at, plain_text, styled
 from ..core.result import Result
 from ..core.units import arcseconds
@@ -256,7 +257,8 @@ class DonutFit(Result):
         return {name: np.sqrt(np.maximum(trace, 0.0)) for name, trace in traces.items()}
 
     def _label(self) -> str:
-        return f"{len(self)} donuts, {int(self.usable.sum())} with results, Zernikes {self.noll[0]} to {self.noll[-1]}"
+        terms = f"Zernikes {self.noll[0]} to {self.noll[-1]}"
+        return f"{counted(len(self), 'donut')}, {int(self.usable.sum())} with results, {terms}"
 
     def to_table(self) -> QTable:
         """Return one row a donut, with units: field, flags, Zernikes and their errors, and the star's own unknowns."""

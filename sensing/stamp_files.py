@@ -14,6 +14,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from astropy import units as u
@@ -23,6 +24,7 @@ from astropy.table import Table
 from ..core.errors import ProductError
 from ..core.files import parsing, require_file
 from ..core.fits_files import open_fits
+from ..core.number_text import counted
 from ..core.table_files import text_table
 from .inputs import SMALLEST_STAMP
 from .stamp_headers import HeaderValues, corner_of, defocus_of, detector_of, header_values, pixel_of, stamp_header
@@ -211,6 +213,9 @@ def _cut_stamps(
 def _units(path: Path) -> list[tuple[fits.Header, np.ndarray | Table | None]]:
     """Return headers and contents of the units of a FITS file: images, tables, or nothing."""
     require_file(path, ProductError)
+    if path.suffix.lower() in (".npy", ".npz"):
+        text = "expected FITS files of images; pachon.fit_donuts takes arrays"
+        raise ProductError(f"{_arrays_text(path)}: {text}", file=path)
     contents: list[tuple[fits.Header, np.ndarray | Table | None]] = []
     with parsing(path, "cannot be read as FITS", ProductError), open_fits(path, ProductError, memmap=False) as units:
         for unit in units:
@@ -219,6 +224,16 @@ def _units(path: Path) -> list[tuple[fits.Header, np.ndarray | Table | None]]:
             elif isinstance(unit, fits.BinTableHDU) and not unit.header.get("EXTNAME", "").startswith("ARCHIVE"):
                 contents.append((unit.header, Table.read(unit)))
     return contents
+
+
+def _arrays_text(path: Path) -> str:
+    """Return shapes and types of the arrays of a NumPy file, in words."""
+    try:
+        content = np.load(path, mmap_mode="r", allow_pickle=False)
+        arrays = {"array": content} if isinstance(content, np.ndarray) else dict(content)
+    except (OSError, ValueError, EOFError, BadZipFile):
+        return "no file of plain NumPy arrays"
+    return ", ".join(f"{name} of shape {list(array.shape)} and type {array.dtype}" for name, array in arrays.items())
 
 
 def _with_planes(
@@ -241,7 +256,7 @@ def _with_planes(
         file = {"mask": mask, "variance": variance}.get(kind) or path
         if kind != "image" and listed and [d.shape for _, d in listed] != [d.shape for _, d in images]:
             shapes, expected = ([list(d.shape) for _, d in units_of[:1]] for units_of in (listed, images))
-            counts = f"{len(listed)} of shape {shapes[0]} for {len(images)} images" + (
+            counts = f"{len(listed)} of shape {shapes[0]} for {counted(len(images), 'image')}" + (
                 f" of {expected[0]}" if expected else ""
             )
             raise ProductError(f"planes of {kind}: {counts}: expected one for each image, as large", file=file)
@@ -372,7 +387,8 @@ def _places(table: Table, count: int, file: Path) -> tuple[np.ndarray | None, np
     """Return field angles [rad] and shifts of the body that moves [m]; None without columns."""
     names = _names(table)
     if len(table) != count:
-        raise ProductError(f"table of {len(table)} rows for {count} stamps: expected one row a stamp", file=file)
+        rows, stamps = counted(len(table), "row"), counted(count, "stamp")
+        raise ProductError(f"table of {rows} for {stamps}: expected one row a stamp", file=file)
     fields = None
     if {"field_x", "field_y"} <= names:
         fields = np.deg2rad(np.stack([_column(table, name, file) for name in ("field_x", "field_y")], axis=-1))

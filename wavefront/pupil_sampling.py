@@ -14,6 +14,7 @@ import numpy as np
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
+from ..core.number_text import counted
 from ..core.units import MOST, require_count
 from ..models.telescope import Telescope
 
@@ -39,7 +40,7 @@ class PupilSampling:
     weights: np.ndarray
 
     def __repr__(self) -> str:
-        return f"<PupilSampling: {len(self)} points>"
+        return f"<PupilSampling: {counted(len(self), 'point')}>"
 
     def __post_init__(self) -> None:
         points, weights = (np.asarray(v, dtype=np.float64) for v in (self.points, self.weights))

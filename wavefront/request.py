@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments, removed_arguments
 from ..core.errors import ConfigError, DomainError, shown
+from ..core.number_text import counted
 from ..core.units import metres, pure_numbers, radians
 from ..models.camera.focal_plane import FocalPlane
 from ..models.design_data import unvignetted, vignetted
@@ -78,9 +79,8 @@ class Request:
 
     def __repr__(self) -> str:
         waves = ", ".join(f"{1e9 * w:.5g}" for w in self.wavelengths[:3]) + ", ..." * (len(self.wavelengths) > 3)
-        return (
-            f"<Request: {self.telescope.name}, {len(self.fields)} fields, {waves} nm, {len(self.pupil)} pupil points>"
-        )
+        fields, points = counted(len(self.fields), "field"), counted(len(self.pupil), "pupil point")
+        return f"<Request: {self.telescope.name}, {fields}, {waves} nm, {points}>"
 
     @classmethod
     @removed_arguments(aiming="telescope=telescope.with_design(aiming=...)")

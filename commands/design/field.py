@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Option
 
 from ...core.errors import ConfigError
+from ...core.number_text import counted
 from .. import completion
 from ..choices import names
 from ..tables import Column, Rows, field_headings, number_texts, range_text
-from ..verdicts import counted
 from .command import Outcome, SharedOptions, design_command
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def _distortion_rows(result: Distortion) -> Rows:
         ("largest shift from the best picture", result.image_text(f"{1e6 * result.largest_shift:.3f} µm")),
         ("rms shift", result.image_text(f"{1e6 * result.rms_shift:.3f} µm")),
     ]
-    caption = f"{s['telescope']}, {s['wavelength_nm']:g} nm, {len(result.fields)} fields"
+    caption = f"{s['telescope']}, {s['wavelength_nm']:g} nm, {counted(len(result.fields), 'field')}"
     verdict = f"Distortion reaches {s['largest_percent']:.4f} % against the scale that fits best over the field."
     return Rows(("metric", "value"), rows, caption, verdict=verdict)
 

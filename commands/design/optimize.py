@@ -14,6 +14,7 @@ from typer import Option
 
 from ...core.errors import ConfigError, PrescriptionError, PrescriptionWarning
 from ...core.file_names import file_name
+from ...core.number_text import counted
 from .. import completion
 from ..choices import choice, names
 from ..inputs import errors_of, warnings_shown
@@ -306,7 +307,7 @@ def _notes(result: Any) -> list[str]:
     """Return merit and operands before and after, glasses and collinear combinations as lines."""
     s, optimum = result.summary(), _optimum(result)
     unit, (start, end) = "µrad" if optimum.in_angles else "µm", 1e6 * optimum.merits
-    lines = [f"rms of {s['merit']}: {start:.6g} -> {end:.6g} {unit}, {s['steps']} steps"]
+    lines = [f"rms of {s['merit']}: {start:.6g} -> {end:.6g} {unit}, {counted(s['steps'], 'step')}"]
     stated = 1e6 * optimum.remeasured[:, 1]
     if stops := ", ".join(optimum.filled_stops):
         lines.append(f"rays fill the stop {stops}, as with --aiming real; without: {_from_to(stated)} {unit}")

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
+from ...core.number_text import counted
 from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, figure_at, plain_text, styled
 from ...core.result import Result
 from ...models.surface import Interaction, Surface
@@ -95,7 +96,7 @@ class Layout(Result):
         return np.array([width, width, height])
 
     def _label(self) -> str:
-        return f"{self.telescope.name}, {len(self.profiles)} surfaces, {len(self.fields)} fields"
+        return f"{self.telescope.name}, {counted(len(self.profiles), 'surface')}, {counted(len(self.fields), 'field')}"
 
     def _columns(self) -> dict[str, Any]:
         surfaces = self.telescope.surfaces

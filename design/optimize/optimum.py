@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...core.number_text import counted
 from ...core.plotting import BLUE, GREY, figure_at, plain_text, styled
 from ...core.result import Result, Values
 from ...models.parameters.parameters import Parameter
@@ -172,7 +173,8 @@ class Optimum(Result):
 
     def _label(self) -> str:
         start, end = self.history[0], self.history[-1]
-        return f"{self.telescope.name}, {len(self.variables)} variables, rms {start:.4g} -> {end:.4g} {self._unit}"
+        variables = counted(len(self.variables), "variable")
+        return f"{self.telescope.name}, {variables}, rms {start:.4g} -> {end:.4g} {self._unit}"
 
     def _columns(self) -> dict[str, Any]:
         names = {"address": list(self.addresses), "unit": [p.unit or "1" for p in self.variables]}

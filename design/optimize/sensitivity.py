@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.number_text import counted
 from ...core.plotting import BLUE, figure_at, plain_text, styled
 from ...core.threads import one_blas_thread
 from ...core.units import field_label, require_count
@@ -135,9 +136,8 @@ class Sensitivity(FieldResult):
             )
             axes.yaxis.set_major_locator(MaxNLocator(integer=True))
             axes.set_ylabel("Noll index")
-            axes.set_title(
-                f"{plain_text(self.telescope)}, {self.wavelength * 1e9:g} nm: rms over {len(self.fields)} fields"
-            )
+            fields = counted(len(self.fields), "field")
+            axes.set_title(f"{plain_text(self.telescope)}, {self.wavelength * 1e9:g} nm: rms over {fields}")
             values, _ = self.modes()
             modes.semilogy(np.arange(1, len(values) + 1), values, "o-", color=BLUE, markersize=3.5, linewidth=0.9)
             modes.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import ConfigError
+from ...core.number_text import counted
 from ...core.plotting import BLUE, GREY, RED, figure_at, plain_text, styled
 from ...core.result import Result, Values
 from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
@@ -181,7 +182,7 @@ class MonteCarlo(Result):
             )
             merit_axes.margins(x=0.12)
             merit_axes.legend(loc="lower right")
-            merit_axes.set_title(f"{len(self.merit)} draws, {self.method}")
+            merit_axes.set_title(f"{counted(len(self.merit), 'draw')}, {self.method}")
             contribution_axes.barh(np.arange(len(shown)), self.contribution[shown] * scale, color=BLUE, height=0.7)
             contribution_axes.set_yticks(np.arange(len(shown)), [plain_text(self.tolerances[i].name) for i in shown])
             contribution_axes.invert_yaxis()

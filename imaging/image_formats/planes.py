@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.errors import ProductError
+from ...core.number_text import counted
 from .fits_parts import FitsPart, FitsParts
 
 #: Planes of LSST's masks that mark an area or an object, and leave a pixel as good as any.
@@ -124,7 +125,8 @@ def companion_in(path: Path, image: FitsPart) -> tuple[FitsParts, FitsPart]:
     same_name = [part for part in planes if part.name and part.name == image.name]
     if not same_name and len(planes) != 1:
         raise ProductError(
-            f"has {len(planes)} images: expected one, or one called {image.name or 'as that of the image'}", file=path
+            f"has {counted(len(planes), 'image')}: expected one, or one called {image.name or 'as that of the image'}",
+            file=path,
         )
     return file, (same_name or planes)[0]
 

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import DomainError
+from ...core.number_text import counted
 from ...core.threads import one_blas_thread
 from ...core.units import pure_numbers, real_array
 from .cutouts import cut_out, first_pixel
@@ -191,7 +192,7 @@ def fit_galaxy_stamps(
     count, ny, nx = pixels.shape
     psfs, templates = _checked_psfs(psf_images, psf_index, count)
     if start is not None and len(start) != count:
-        raise DomainError(f"start: {len(start)} fits of {count} galaxies")
+        raise DomainError(f"start: {len(start)} fits of {counted(count, 'galaxy', 'galaxies')}")
     side = -(-max(ny, nx) // SIDE_STEP) * SIDE_STEP
     first_row, first_column = (side - ny) // 2, (side - nx) // 2
     parts, members = [_no_fits()], [np.empty(0, dtype=np.int64)]
@@ -323,7 +324,7 @@ def _checked_psfs(psf_images: ArrayLike, psf_index: ArrayLike | None, count: int
         if count and not (index.min() >= 0 and index.max() < len(psfs)):
             raise DomainError(f"psf_index: {index.min()} to {index.max()}, expected 0 to {len(psfs) - 1}")
     elif not shared and len(psfs) != count:
-        raise DomainError(f"psf_images: {len(psfs)} for {count} galaxies")
+        raise DomainError(f"psf_images: {len(psfs)} for {counted(count, 'galaxy', 'galaxies')}")
     sums = psfs.sum(axis=(1, 2))
     wrong = ~(np.abs(sums - 1.0) < _PSF_SUM_TOLERANCE)
     if wrong.any():

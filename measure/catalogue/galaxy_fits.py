@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.number_text import counted
 from ...core.point_plots import draw_shapes
 from ...core.products import Columns, described_table
 from ...core.result import Result
@@ -184,7 +185,7 @@ class GalaxyFits(Result):
         return np.sqrt((spread * gradient).sum(axis=1))
 
     def _label(self) -> str:
-        return f"{len(self)} galaxies, {int(self.good.sum())} without a flag"
+        return f"{counted(len(self), 'galaxy', 'galaxies')}, {int(self.good.sum())} without a flag"
 
     def to_table(self) -> QTable:
         """Return the fits of :meth:`table`."""

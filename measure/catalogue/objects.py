@@ -11,6 +11,7 @@ from astropy.table import QTable, Table
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.number_text import counted
 from ...core.point_plots import draw_points
 from ...core.products import Columns, described_table
 from ...core.result import Result
@@ -113,7 +114,7 @@ class DetectedObjects(Result):
 
     def _label(self) -> str:
         ny, nx = self.segmentation.shape
-        return f"{len(self)} objects of an image of {nx} x {ny} pixels"
+        return f"{counted(len(self), 'object')} of an image of {nx} x {ny} pixels"
 
     def to_table(self) -> QTable:
         """Return the catalogue of :meth:`table`, without magnitudes."""

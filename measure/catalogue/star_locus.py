@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.number_text import counted
 from ...core.point_plots import draw_points
 from ...core.result import Result
 from ...core.statistics import RMS_PER_MAD
@@ -138,7 +139,7 @@ class StarSelection(Result):
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the places of the selected stars, coloured by the logarithm of their S/N."""
-        title = f"{len(self)} stars, half-light radius {self.half_light_radius:.3g} pixel"
+        title = f"{counted(len(self), 'star')}, half-light radius {self.half_light_radius:.3g} pixel"
         x, y = self.positions.T
         color = {"color": np.log10(self.snr), "color_label": "log10 of S/N"}
         return draw_points(ax, x, y, ("x [pixel]", "y [pixel]"), **color, equal=True, title=title)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.launch import launch, load_kernels
+from ...core.number_text import counted
 from ...core.random_streams import stream
 from ...core.threads import one_blas_thread, thread_count
 from ...core.units import has_unit, positive_angle, real_array, require_count, require_seed
@@ -107,7 +108,7 @@ class ShearEstimator:
 
     def __repr__(self) -> str:
         n = len(self._inverse)
-        return f"<ShearEstimator: {n} PSF{'s' * (n != 1)}, stamps of {self._side} pixels>"
+        return f"<ShearEstimator: {counted(n, 'PSF')}, stamps of {self._side} pixels>"
 
     @property
     def covariance(self) -> np.ndarray:

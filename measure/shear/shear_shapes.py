@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.number_text import counted
 from ...core.point_plots import draw_bars, draw_shapes
 from ...core.result import Result, Values
 from ...core.units import for_each, pure_numbers, real_array
@@ -245,7 +246,7 @@ def _patch_labels(count: int, patch: ArrayLike | None, name: str = "patch") -> n
     """Return the patch of each galaxy, [count]: runs of consecutive galaxies where none are given."""
     if patch is None:
         if count < 2:
-            raise DomainError(f"shapes: {count} galaxies, expected at least two")
+            raise DomainError(f"shapes: {counted(count, 'galaxy', 'galaxies')}, expected at least two")
         return np.arange(count) * min(_PATCHES, count) // count
     labels = real_array(patch, f"{name}: expected the patch of each of {count} galaxies, a number")
     if labels.shape != (count,):

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_unique, unknown_name
 from ...core.notebook import Pictured
+from ...core.number_text import counted
 from ...core.units import plane_points
 from .photometry import CameraPhotometry
 
@@ -144,7 +145,7 @@ class Camera(Pictured):
     def __repr__(self) -> str:
         count = len(self.raft_names)
         rafts = f" on {count} raft{'s' * (count != 1)}" if count else ""
-        return f"<Camera {self.name}: {len(self)} CCDs{rafts}>"
+        return f"<Camera {self.name}: {counted(len(self), 'CCD')}{rafts}>"
 
     def __len__(self) -> int:
         return len(self.ccd_names)

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.number_text import counted
 from ...core.units import metres, plane_points, radians, require_count
 from .camera import Camera
 from .cameras import load_camera
@@ -79,7 +80,7 @@ class FocalPlane(HeightMap):
     def __repr__(self) -> str:
         measured = f", heights of {self.measured.sum()} measured" if self.measured.any() else ""
         drawn = "" if self.seed is None else f", seed {self.seed}"
-        return f"<FocalPlane of {self.camera.name}: {len(self.camera)} CCDs{measured}{drawn}>"
+        return f"<FocalPlane of {self.camera.name}: {counted(len(self.camera), 'CCD')}{measured}{drawn}>"
 
     @classmethod
     def from_budget(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.number_text import counted
 from ...core.units import metres
 from .camera import Camera
 from .ccd_surfaces import POWERS, CcdSurfaces, spline_weights
@@ -44,7 +45,9 @@ def fit_heights(
     order = np.argsort(ccd, kind="stable")
     order = order[ccd[order] >= 0]
     if not order.size:
-        raise DomainError(f"heights: none of {len(x)} points lies on a CCD: expected x, y in m on the focal plane")
+        raise DomainError(
+            f"heights: none of {counted(len(x), 'point')} lies on a CCD: expected x, y in m on the focal plane"
+        )
     bounds = np.searchsorted(ccd[order], np.arange(len(camera) + 1))
     counts = np.diff(bounds)
     rich = counts[counts >= _SPLINE_POINTS]
@@ -100,7 +103,7 @@ def _fit_polynomial(u: np.ndarray, v: np.ndarray, z: np.ndarray, name: str) -> t
         if spread[0] > 1e-10 * spread[-1]:
             solution = np.linalg.solve(normal, np.einsum("in,n->i", design, z))
             return np.concatenate([solution, np.zeros(10 - size)]), z - np.einsum("in,i->n", design, solution)
-    raise DomainError(f"heights on {name}: {len(z)} points: expected at least 3 that are not on one line")
+    raise DomainError(f"heights on {name}: {counted(len(z), 'point')}: expected at least 3 that are not on one line")
 
 
 def _bending(m: int) -> csc_array:

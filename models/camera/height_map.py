@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...core.number_text import counted
 from ...core.plotting import axes_at, figure_of, plain_text, styled
 from ...core.result import Result
 from .camera import Camera
@@ -35,7 +36,7 @@ class HeightMap(Result):
     def _label(self) -> str:
         measured = f", heights of {self.measured.sum()} measured" if self.measured.any() else ""
         drawn = "" if self.seed is None else f", seed {self.seed}"
-        return f"{self.camera.name}, {len(self.camera)} CCDs{measured}{drawn}"
+        return f"{self.camera.name}, {counted(len(self.camera), 'CCD')}{measured}{drawn}"
 
     def _summary(self) -> dict[str, Any]:
         heights = 1e6 * self._sampled()

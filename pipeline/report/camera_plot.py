@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
+from ...core.number_text import counted
 from ...core.plotting import new_figure, plain_text, styled
 from ...measure.focal_plane_axes import ccd_corners, draw_outlines, frame_axes
 from ...models.camera.camera import Camera
@@ -39,5 +40,5 @@ def camera_plot(camera: Camera) -> Figure:
             axes.plot(*at, "o", color="0.3", markersize=max(0.03 * width, 0.6))
         frame_axes(axes, (-edge, edge, -edge, edge))
         pixel = f"pixels of {camera.pixel_size * 1e6:g} um"
-        axes.set_title(plain_text(f"{camera.name}: {len(camera)} CCDs, {pixel}; dots: first pixels"))
+        axes.set_title(plain_text(f"{camera.name}: {counted(len(camera), 'CCD')}, {pixel}; dots: first pixels"))
         return figure

@@ -18,6 +18,7 @@ from astropy.table import Table
 
 from ...core.errors import PachonError, ProductError
 from ...core.files import make_folder, write_bytes, write_json
+from ...core.number_text import counted
 from ...core.products import Stamp, described_table, write_ecsv
 from ...measure.correlation import Correlation
 from ...measure.correlation_plots import correlation_columns, rho_plot
@@ -119,7 +120,7 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
         raise ProductError("no configuration that pachon run wrote (defaults are not filled in)", file=path)
     stamp, names = stamp_of(experiment), config.ccds or ()
     if not any(product_path(folder, name).exists() for name in names):
-        raise ProductError(f"none of its {len(names)} CCDs is finished", file=folder)
+        raise ProductError(f"none of its {counted(len(names), 'CCD')} is finished", file=folder)
     products, unreadable_ccds = [], {}
     for name in names:
         try:

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
+from ...core.number_text import counted
 from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, plain_text, styled
 from ...measure.focal_plane_axes import draw_outlines, frame_axes
 from ...models.camera.camera import Camera
@@ -41,7 +42,7 @@ def vendor_heights_plot(focal_plane: FocalPlane, title: str) -> Figure:
         edge = float(np.ceil(np.nanpercentile(np.abs(heights), 99.8)))
         for name, of in groups.items():
             row, colour = statistics[name], colours[name]
-            label = f"{name.upper()}: {row.n_ccd} CCDs, rms {row.rms * 1e6:.1f} µm"
+            label = f"{name.upper()}: {counted(row.n_ccd, 'CCD')}, rms {row.rms * 1e6:.1f} µm"
             bins = list(np.linspace(-edge, edge, 81))
             upper.hist(heights[of].ravel(), bins, density=True, histtype="step", color=colour, lw=1.4, label=label)
             within = np.ptp(np.nanpercentile(heights[of], (2.5, 97.5), axis=1), axis=0)

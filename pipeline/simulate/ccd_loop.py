@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from ...core.errors import DomainError, PachonError, ProductError, attempt
+from ...core.number_text import counted
 from ...core.progress import Reporter
 from ...core.threads import thread_count
 from ..experiment import Experiment
@@ -74,7 +75,7 @@ def simulate_ccds(
     else:
         total = sum(len(f.holdout) + len(f.observed) for f in fields.values())
     overlap = thread_count(threads) > 1
-    bar = reporter.stage(title or f"PSFs of {len(names)} CCDs", total=total)
+    bar = reporter.stage(title or f"PSFs of {counted(len(names), 'CCD')}", total=total)
     with bar as stage, ThreadPoolExecutor(1) as modeller:
         pending: list[tuple[list[str], Future[Sequence[_T | PachonError]]]] = []
 
@@ -185,7 +186,8 @@ def _ccds_short_of_stars(experiment: Experiment, names: Sequence[str]) -> Iterat
         for name in names:
             count = experiment.observed_count(name)
             if count < least:
-                yield name, f"{count} stars of {experiment.star_list.name} lie on it: expected at least {least}"
+                stars = counted(count, "star")
+                yield name, f"{stars} of {experiment.star_list.name} on it: expected at least {least}"
 
 
 def left_out_line(name: str, reason: str) -> str:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments, removed_arguments
 from ...core.docstrings import Description, described
 from ...core.errors import DomainError
+from ...core.number_text import counted
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
 from ...core.result import Result
@@ -199,7 +200,7 @@ class FocalPlanePsf(ModelFields, Result):
         return model._with_stamps(catalogue, components, threads, reporter)
 
     def _label(self) -> str:
-        return f"{int(self.used.sum())} of {len(self.used)} stars"
+        return f"{int(self.used.sum())} of {counted(len(self.used), 'star')}"
 
     def _columns(self) -> dict[str, Any]:
         predicted = self.leave_one_out
@@ -373,7 +374,7 @@ def _fit_warnings(
     empty = [n for i, n in enumerate(field.mosaic.names) if i not in ccds and n in expected]
     if empty:
         shown = ", ".join(empty[:5]) + (", ..." if len(empty) > 5 else "")
-        remarks.append(f"{len(empty)} CCDs without stars, predicted from the others: {shown}")
+        remarks.append(f"{counted(len(empty), 'CCD')} without stars, predicted from the others: {shown}")
     if len(ccds) == 1:
         remarks.append("all stars are on one CCD: elsewhere the prediction is their mean")
     return tuple(remarks)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
 from ...core.files import parsing, require_file
+from ...core.number_text import counted
 from ...core.point_plots import draw_points
 from ...core.result import Result
 from ...core.units import ARCSEC
@@ -171,7 +172,7 @@ class FocalPlaneStars(Result):
             if pixel_scale is None:
                 raise DomainError("stamps: expected pixel_scale, the angle of a pixel in radians")
             if len(images) != len(x):
-                raise DomainError(f"{len(images)} stamps for {len(x)} stars")
+                raise DomainError(f"{counted(len(images), 'stamp')} for {counted(len(x), 'star')}")
             cube = images / images.sum(axis=(1, 2), keepdims=True)
         if "e1" in columns:
             size = _quantity(columns, "size", u.rad)
@@ -197,7 +198,8 @@ class FocalPlaneStars(Result):
         if len(set(lengths.values())) > 1:
             raise DomainError(f"stars: columns of different lengths, {lengths}")
         if "used" in columns and len(np.asarray(columns["used"])) != len(x):
-            raise DomainError(f"stars: column 'used' has {len(np.asarray(columns['used']))} values for {len(x)} stars")
+            flags = counted(len(np.asarray(columns["used"])), "value")
+            raise DomainError(f"stars: column 'used' has {flags} for {counted(len(x), 'star')}")
         if "used" in columns:
             stars = stars.chosen(np.asarray(columns["used"], dtype=bool))
         return stars

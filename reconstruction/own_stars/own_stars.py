@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.number_text import counted
 from ...core.random_streams import stream
 from ...core.statistics import finite_median, median_image
 from ...core.units import positive_angle, real_array, require_seed
@@ -183,7 +184,7 @@ def fit_own_stars(
     widths[wide.usable] = fwhm(filled[wide.usable], scale)
     weight = finite_median(widths)
     if not np.isfinite(weight):
-        raise DomainError(f"none of {len(images)} stamps has a star in its middle")
+        raise DomainError(f"none of {counted(len(images), 'stamp')} has a star in its middle")
 
     def fill(earlier: FilledStars | None = None) -> FilledStars:
         filled_stars = fill_by_median_star(images, bad[inner], scale, weight, earlier)

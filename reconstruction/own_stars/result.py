@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.number_text import counted
 from ...core.plotting import BLUE, ORANGE, RED, figure_at, label_log_axis, plain_text, styled
 from ...core.products import Columns, described_table
 from ...core.result import Result
@@ -160,7 +161,7 @@ class OwnStars(Result):
         return _draw(self, title, ax)
 
     def _label(self) -> str:
-        return f"{len(self.used)} stars, {int(self.used.sum())} used, {self.model!r}"
+        return f"{counted(len(self.used), 'star')}, {int(self.used.sum())} used, {self.model!r}"
 
     def to_table(self) -> QTable:
         """Return the stars of :meth:`table`."""
@@ -287,7 +288,7 @@ def _draw(own: OwnStars, title: str, ax: Axes | Figure | None) -> Figure:
         _stamps(own, figure.add_subplot(grid[2, :]))
         metrics = own.summary()
         figure.suptitle(
-            f"{plain_text(title)}: {metrics['used']} of {metrics['stars']} stars, "
+            f"{plain_text(title)}: {metrics['used']} of {counted(metrics['stars'], 'star')}, "
             f"FWHM {metrics['fwhm_arcsec']:.3g} arcsec; "
             f"rms of e held out {100 * metrics['rms_e_held_out']:.2g} %, "
             f"noise of the stars {100 * metrics['rms_e_noise']:.2g} %",

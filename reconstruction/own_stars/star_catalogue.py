@@ -16,6 +16,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import ProductError
 from ...core.files import parsing, read_bytes, text_lines
 from ...core.fits_files import unpacked_bytes
+from ...core.number_text import counted
 from .lsst_stamps import is_stamp_file, read_stamp_file
 from .stamp_weights import without_weightless
 
@@ -160,7 +161,8 @@ def load_stars(
     positions = np.stack([_checked_column(path, name, columns[names[name.lower()]], 1) for name in (x, y)], axis=1)
     stamps = _checked_column(path, stamp, columns[names[stamp.lower()]], 3) if cube is None else cube
     if len(stamps) != len(positions):
-        raise ProductError(f"{len(positions)} stars in the table, {len(stamps)} stamps in the images", file=path)
+        stars, images = counted(len(positions), "star"), counted(len(stamps), "stamp")
+        raise ProductError(f"{stars} in the table, {images} in the images", file=path)
     finite = np.isfinite(positions).all(axis=1)
     if not finite.all():
         row = int(finite.argmin())

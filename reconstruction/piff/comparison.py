@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from ...core.arguments import check_arguments
 from ...core.files import make_folder, write_bytes, write_json
+from ...core.number_text import counted
 from ...core.products import Columns, described_table, write_ecsv
 from ...core.result import Result
 from ...core.statistics import finite_mean, rms
@@ -56,7 +57,7 @@ class PiffComparison(Result):
     rho: dict[str, RhoStatistics]
 
     def _label(self) -> str:
-        return f"{len(self.stars)} stars, {', '.join(self.models['model'])}"
+        return f"{counted(len(self.stars), 'star')}, {', '.join(self.models['model'])}"
 
     def _summary(self) -> dict[str, Any]:
         return {row["model"]: {k: row[k] for k in self.models.colnames[1:]} for row in self.models}

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import PachonError, ProductError
+from ...core.number_text import counted
 from ...core.plotting import figure_at, styled
 from ...core.products import read_fits, write_fits
 from ...core.result import Result
@@ -165,8 +166,8 @@ class PsfModel(ModelFit, Result):
 
     def _label(self) -> str:
         ny, nx = self.mean.shape
-        components, order = f"{self.n_components} components ({self.basis.name})", self.order
-        return f"{components}, order {order}, {self.n_stars} stars, stamps {nx} x {ny}"
+        components, order = f"{counted(self.n_components, 'component')} ({self.basis.name})", self.order
+        return f"{components}, order {order}, {counted(self.n_stars, 'star')}, stamps {nx} x {ny}"
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the mean PSF and the first components, each over its largest magnitude."""

@@ -6,6 +6,7 @@ and nothing of an expression is evaluated by Python.
 
 from __future__ import annotations
 
+import re
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -33,6 +34,8 @@ _HEADER_BYTES = 1 << 16
 _HEADER_LINES = 1000
 # What an expression may do: read the columns of the table, and call functions.
 _ALLOWED = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION)
+# Texts, names and comments of SQL; the group is the content of a name in double quotes.
+_TOKENS = re.compile(r"""'(?:[^']|'')*'|`(?:[^`]|``)*`|\[[^]]*\]|--[^\n]*|/\*.*?\*/|"((?:[^"]|"")*)\"""", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,7 @@ class ListTable:
         """
         names = ", ".join(f'"{column}"' for column in columns)
         # The expression stands on lines of its own, so that a comment in it ends there.
-        query = f'SELECT {names} FROM "{self.name}"' + ("" if where is None else f" WHERE (\n{where}\n)")
+        query = f'SELECT {names} FROM "{self.name}"' + ("" if where is None else f" WHERE (\n{_quoted_names(where)}\n)")
         selects = 0
 
         def authorize(action: int, table: str | None, _column: Any, _database: Any, _trigger: Any) -> int:
@@ -72,8 +75,8 @@ class ListTable:
         except (sqlite3.Error, sqlite3.Warning, ValueError) as error:
             if where is None:
                 raise ProductError(f"cannot be read ({error})") from None
-            text = f"where = {cut_short(where)}: {error}; expected a condition on its columns, in SQL: "
-            raise ConfigError(text + ", ".join(self.columns), key="where") from None
+            expected = f"a condition on its columns, in SQL with texts in single quotes: {', '.join(self.columns)}"
+            raise ConfigError(f"where = {cut_short(where)}: {error}; expected {expected}", key="where") from None
         finally:
             self.connection.set_authorizer(None)
         if not chunks:
@@ -129,6 +132,19 @@ def read_header(path: Path) -> dict[str, np.ndarray]:
     if not header:
         raise ProductError(problem, file=path)
     return header
+
+
+def _quoted_names(where: str) -> str:
+    """Return an expression with its names in double quotes in backticks.
+
+    In double quotes SQLite takes a name that no column has for a text, as in ``"airmas" > 1``, which always holds.
+    """
+
+    def in_backticks(token: re.Match[str]) -> str:
+        name = token[1]
+        return token[0] if name is None else "`" + name.replace('""', '"').replace("`", "``") + "`"
+
+    return _TOKENS.sub(in_backticks, where)
 
 
 def _database_table(connection: sqlite3.Connection, path: Path) -> ListTable:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, check_choice, error_context
+from ...core.number_text import counted
 from ...core.statistics import FWHM_PER_RMS
 from ...core.units import ARCSEC
 from ...models.io.site_file import load_site
@@ -115,7 +116,8 @@ def _visits(
     columns.require("ra"), columns.require("dec")
     ra = columns.complete("ra", lambda angle: np.abs(angle) <= 4.0 * np.pi, "a finite angle") % (2.0 * np.pi)
     dec = columns.complete("dec", lambda angle: np.abs(angle) <= 0.5 * np.pi, "-90 to 90 deg")
-    snaps = columns.numbers("snaps", 1.0)
+    snaps = columns.stated("snaps", _is_whole, "a whole number")
+    # Of no number, and of 0, the exposure is not divided.
     snaps = np.where(snaps >= 1.0, snaps, 1.0).astype(np.int64)
     exposure = _exposure_times(columns, snaps)
     midpoint = _midpoints(columns, exposure, snaps)
@@ -174,7 +176,7 @@ def _visit_numbers(columns: ListColumns) -> np.ndarray:
         twice = unique[counts > 1]
         others = f"; {len(twice)} numbers are repeated" if len(twice) > 1 else ""
         raise DomainError(
-            f"{name} = {twice[0]}: {counts[counts > 1][0]} rows, expected each visit once{others}", key=name
+            f"{name} = {twice[0]}: {counted(counts[counts > 1][0], 'row')}, expected each visit once{others}", key=name
         )
     return numbers
 
@@ -272,15 +274,15 @@ def _horizontal(columns: ListColumns, angles: SkyAngles) -> tuple[np.ndarray, np
         altitude = 0.5 * np.pi - columns.numbers("zenith_distance")
     listed = np.isfinite(altitude)
     if not listed.all():
-        columns.remarks.append(
-            f"{(~listed).sum()} of {len(columns)} visits have no altitude: it is that of place and time"
-        )
+        visits_have = counted(len(columns), "visit has", "visits have")
+        columns.remarks.append(f"{(~listed).sum()} of {visits_have} no altitude: it is that of place and time")
     difference = np.where(listed, np.abs(altitude - angles.altitude), 0.0)
     apart = np.flatnonzero(difference > _ALTITUDE_DIFFERENCE)
     if apart.size:
         worst = int(np.argmax(difference))
+        altitudes_differ = counted(len(apart), "altitude differs", "altitudes differ")
         columns.remarks.append(
-            f"altitudes of {len(apart)} visits differ by over 1 deg from those by place and time, of visit "
+            f"{altitudes_differ} by over 1 deg from those by place and time, of visit "
             f"{columns.values['visit'][worst]} by {np.rad2deg(difference[worst]):.1f} deg; those of the list are taken"
         )
     altitude = np.where(listed, altitude, angles.altitude)

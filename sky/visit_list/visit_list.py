@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.number_text import counted
 from ...core.point_plots import draw_points
 from ...core.result import Result
 
@@ -187,7 +188,8 @@ class VisitList(Result):
         """Return the visit of a number, or raise DomainError."""
         matches = np.flatnonzero(self.visit == number)
         if not len(matches):
-            raise DomainError(f"visit = {number}: not in the list of {len(self)} visits", file=self.source or None)
+            visits = counted(len(self), "visit")
+            raise DomainError(f"visit = {number}: not in the list of {visits}", file=self.source or None)
         return self[int(matches[0])]
 
     @property

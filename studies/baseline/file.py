@@ -19,6 +19,7 @@ from ...core.arguments import check_arguments
 from ...core.ccd_names import refuse_mirrored_names
 from ...core.errors import ConfigError
 from ...core.files import read_bytes, write_bytes
+from ...core.number_text import counted
 from ...core.schema import Positive, Real, Section, validated
 from ..metrics.scene import Plan
 
@@ -88,7 +89,7 @@ class Baseline(Section):
         return self.model_copy(update={"figures": metrics})
 
     def __repr__(self) -> str:
-        return f"<Baseline of {self.model}: {len(self.figures)} metrics>"
+        return f"<Baseline of {self.model}: {counted(len(self.figures), 'metric')}>"
 
 
 @check_arguments

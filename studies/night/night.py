@@ -13,6 +13,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError, PachonError, ProductError
 from ...core.files import make_folder
 from ...core.long_work import Execution, claim_folder
+from ...core.number_text import counted
 from ...core.products import Stamp
 from ...pipeline.experiment import Experiment
 from ...pipeline.listed_visit import check_bands, visit_experiment
@@ -22,7 +23,7 @@ from ...sky.visit_list.visit_list import ListedVisit, VisitList
 from .config import NightConfig, load_night_configuration
 from .night_files import write_night
 from .sky_pixels import healpix_module
-from .visit_product import VisitProduct, VisitWork, product_name
+from .visit_product import VisitProduct, VisitWork, has_ccd_products, product_name
 
 #: Folder of the products of the visits.
 VISITS_FOLDER = "visits"
@@ -114,10 +115,10 @@ def run_night(
     products = folder / VISITS_FOLDER
     make_folder(products)
     paths = {visit: products / product_name(visit) for visit in visits.visit.tolist()}
-    finished = set(execution.finished(paths, stamp))
+    finished = _finished(config, experiment, paths, stamp, execution)
     due = [i for i in range(number - 1, len(visits), parts) if int(visits.visit[i]) not in finished]
     if finished:
-        reporter.line(f"{len(finished)} of {len(visits)} visits are finished already")
+        reporter.line(f"{len(finished)} of {counted(len(visits), 'visit is', 'visits are')} finished already")
     write = partial(write_night, folder, config, experiment, visits, stamp)
     written = len(finished)
     for visit, reason in _results(
@@ -131,11 +132,21 @@ def run_night(
             written = len(finished)
     if parts > 1:
         other_visits = {visit: path for visit, path in paths.items() if visit not in finished}
-        finished |= set(execution.finished(other_visits, stamp))
+        finished |= _finished(config, experiment, other_visits, stamp, execution)
     missing = tuple(visit for visit in paths if visit not in finished)
     with reporter.stage("tables and maps"):
         left_out, summary = write(_read(paths, finished, stamp), complete=not missing)
     return NightResult(folder, visits, left_out, missing, summary)
+
+
+def _finished(
+    config: NightConfig, experiment: Experiment, paths: dict[int, Path], stamp: Stamp, execution: Execution
+) -> set[int]:
+    """Return the visits whose products are whole, those of their CCDs among them where these are kept."""
+    finished = set(execution.finished(paths, stamp))
+    if not config.products:
+        return finished
+    return {visit for visit in finished if has_ccd_products(paths[visit], stamp, experiment.camera)}
 
 
 def _results(
@@ -149,7 +160,7 @@ def _results(
         partial(work.compute_here, execution.reporter) if alone else work,
         [visit.label for visit in due],
         due,
-        title=None if alone else f"{len(due)} visits",
+        title=None if alone else counted(len(due), "visit"),
         folder=folder,
         product=lambda number: folder / product_name(due[number].visit),
         check=lambda processes: check_memory(experiment, execution.threads if alone else 1, copies=processes),

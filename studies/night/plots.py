@@ -7,8 +7,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from matplotlib.colors import Normalize
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
+from ...core.number_text import counted
 from ...core.plotting import new_figure, png_bytes, styled
 from ...measure.correlation_plots import draw_correlation, log_axes
 from ...measure.focal_plane_axes import AWAY, TRUTH
@@ -29,6 +32,12 @@ _DOTTED = 10.0
 #: Area of a dot [pt^2].
 _DOT = 5.0
 _MARGIN = 0.04
+#: Least side of a panel over the other.
+_FLATTEST = 0.5
+#: Place of the colour bar beside a panel: left, bottom, width, height in units of the panel.
+_BAR = (1.03, 0.0, 0.04, 1.0)
+#: Relative difference of the values of a map up to which they are one number.
+_ONE_VALUE = 1e-6
 
 
 def maps_plot(maps: NightMaps) -> bytes:
@@ -47,7 +56,7 @@ def maps_plot(maps: NightMaps) -> bytes:
                 if grid.dotted:
                     axes.scatter(*grid.dots, c=content[grid.dot_pixels], s=_DOT, linewidths=0.0, zorder=1.0, **style)
                 image = axes.pcolormesh(*grid.mesh, grid.values(content), zorder=1.1, **style)
-                figure.colorbar(image, ax=axes, shrink=0.7)
+                _colour_bar(image, axes, counts=column == _COUNTED)
                 axes.set_title(f"{band}: {title}", loc="left", fontsize=9)
                 grid.label(axes)
         return png_bytes(figure)
@@ -62,11 +71,24 @@ def correlations_plot(means: Mapping[str, Mapping[str, MeanCorrelation]]) -> byt
             for kind, correlation in kinds.items():
                 draw_correlation(axes, correlation, "plus", *_LABELS[kind])
             visits = max(correlation.visits for correlation in kinds.values())
-            log_axes(axes, f"{band}, {visits} visit{'s' if visits > 1 else ''}")
+            log_axes(axes, f"{band}, {counted(visits, 'visit')}")
             axes.set_xlabel("separation [arcmin]")
         panels[0].set_ylabel("$|\\xi_+|$ of g, mean over visits")
         panels[0].legend(loc="best")
         return png_bytes(figure)
+
+
+def _colour_bar(image: QuadMesh, axes: Axes, *, counts: bool) -> None:
+    """Draw the colour bar of a map, as high as its panel: whole numbers for counts, one number for a map of one."""
+    lowest, highest = image.get_clim()
+    bar = axes.figure.colorbar(image, cax=axes.inset_axes(_BAR))
+    if counts:
+        bar.locator = MaxNLocator(nbins="auto", integer=True)
+    elif highest - lowest <= _ONE_VALUE * abs(highest):
+        bar.set_ticks([highest], labels=[f"{highest:.4g}"])
+    else:
+        bar.formatter = ScalarFormatter(useOffset=False)
+    bar.update_ticks()
 
 
 class _Grid:
@@ -85,9 +107,13 @@ class _Grid:
             self._offset, self._dec = np.linspace(-180.0, 180.0, 2 * _GRID), np.linspace(-90.0, 90.0, _GRID)
         else:
             margin = max(_MARGIN * (high - low), 0.02)
-            across = margin / max(np.cos(np.deg2rad(0.5 * (low + high))), 0.02)
+            degree = max(np.cos(np.deg2rad(0.5 * (low + high))), 0.02)  # of right ascension, on the sky
+            width, height = degree * np.ptp(offset) + 2.0 * margin, high - low + 2.0 * margin
+            least_side = _FLATTEST * max(width, height)
+            across = (margin + 0.5 * max(least_side - width, 0.0)) / degree
+            along = margin + 0.5 * max(least_side - height, 0.0)
             self._offset = np.linspace(offset.min() - across, offset.max() + across, _GRID)
-            self._dec = np.linspace(max(low - margin, -90.0), min(high + margin, 90.0), _GRID)
+            self._dec = np.linspace(max(low - along, -90.0), min(high + along, 90.0), _GRID)
         #: Whether a CCD is too small to be seen, and has a dot.
         self.dotted = max(float(np.ptp(self._offset)) * np.cos(north.mean()), high - low) > _DOTTED
         cells = [np.searchsorted(axis, at) for axis, at in ((self._offset, offset), (self._dec, dec))]

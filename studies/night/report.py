@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ...core.number_text import counted
 from ...core.page import Picture, render, with_error
 from ...core.version import VERSION
 from ...sky.visit_list.visit_list import VisitList
@@ -58,7 +59,7 @@ def night_page(
 def verdict(summary: Mapping[str, Any]) -> str:
     """Return the result of a night in one sentence."""
     seen = summary["finished"] - len(summary["left_out"])
-    count = f"{seen} of {summary['visits']} visits have a PSF"
+    count = f"{seen} of {counted(summary['visits'], 'visit has', 'visits have')} a PSF"
     bands = summary["bands"]
     if not bands:
         return f"{count}."

@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import DomainError, PachonError, ProductError
-from ...core.products import Columns, Stamp, column, read_fits, table_hdu, write_fits
+from ...core.number_text import counted
+from ...core.products import Columns, Stamp, column, is_whole, read_fits, table_hdu, write_fits
 from ...core.progress import Reporter
+from ...models.camera.camera import Camera
 from ...pipeline.experiment import Experiment
 from ...pipeline.listed_visit import visit_experiment
 from ...pipeline.resolved_values import resolved_value
@@ -23,7 +25,7 @@ from ...pipeline.simulate.ccd_model import CcdFit, fit_ccds, model_ccds
 from ...pipeline.simulate.photometry import PROVISIONAL_FWHM
 from ...pipeline.simulate.sky_axes import sky_jacobians
 from ...pipeline.simulate.star_field import StarField
-from ...reconstruction.ccd_product import CcdProduct, write_product
+from ...reconstruction.ccd_product import CcdProduct, product_path, write_product
 from ...sky.visit_list.visit_list import ListedVisit
 from . import detector_row as rows
 from . import residual_correlation as xi
@@ -142,7 +144,7 @@ class VisitWork:
                 raise fit
             if isinstance(model, CcdProduct):
                 cards = ccd_cards(experiment, exposure.name)
-                write_product(folder, model, self.stamp, cards, f"visit_{visit.visit}_")
+                write_product(folder, model, self.stamp, cards, _prefix(visit.visit))
             detectors[exposure.name] = _row(experiment, visit, exposure, shapes) | rows.model_columns(experiment, fit)
             places[ccd] = shapes
             truth = np.stack([shapes.g1, shapes.g2])
@@ -157,7 +159,7 @@ class VisitWork:
                 reduce,
                 names,
                 fields={name: _fields(experiment, name, self.config.models) for name in names},
-                title=f"{visit.label}, {visit.band}: {len(names)} CCDs",
+                title=f"{visit.label}, {visit.band}: {counted(len(names), 'CCD')}",
                 strict=False,
                 together=_STARS_TOGETHER,
                 threads=threads,
@@ -177,6 +179,18 @@ class VisitWork:
 def product_name(visit: int) -> str:
     """Return the name of the file of a visit."""
     return f"visit_{visit}.fits"
+
+
+def has_ccd_products(path: Path, stamp: Stamp, camera: Camera) -> bool:
+    """Return whether the CCDs of a visit, by the file of the visit, have whole products beside it."""
+    product = VisitProduct.read(path, stamp)
+    names = [camera.ccd_names[ccd] for ccd in product.detectors.get("detector", ())]
+    return all(is_whole(product_path(path.parent, name, _prefix(product.visit)), stamp) for name in names)
+
+
+def _prefix(visit: int) -> str:
+    """Return the beginning of the names of the products of a visit's CCDs."""
+    return f"visit_{visit}_"
 
 
 def _one_line(error: PachonError, visit: ListedVisit) -> str:

@@ -11,6 +11,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, ProductError
 from ...core.long_work import Execution
 from ...core.memory import available_bytes, readable
+from ...core.number_text import counted
 from ...core.random_streams import stream
 from ...pipeline.config import Configuration
 from .design import design_points, point_count
@@ -86,10 +87,12 @@ def run_sweep(
         points = store.points()
         unfinished_points = [p for p in points if p.number not in finished]
         if finished:
-            execution.reporter.line(f"{len(finished)} of {len(points)} points are there already")
+            execution.reporter.line(
+                f"{len(finished)} of {counted(len(points), 'point is', 'points are')} there already"
+            )
         if unfinished_points:
             labels = [point.label for point in unfinished_points]
-            title = f"{sweep.name}: {len(labels)} points"
+            title = f"{sweep.name}: {counted(len(labels), 'point')}"
             compute = PointMeasurement(sweep, place)
             with execution.results(compute, labels, unfinished_points, title=title, save=save) as results:
                 for result in results:

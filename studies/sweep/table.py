@@ -14,6 +14,7 @@ from astropy.table import Table
 from ...core.arguments import check_arguments
 from ...core.docstrings import Description
 from ...core.errors import DomainError, ProductError, unknown_name
+from ...core.number_text import counted
 from ...core.plotting import BLUE, figure_at, plain_text, styled
 from ...core.products import Columns, described_table
 from ...core.result import Result
@@ -86,7 +87,8 @@ class SweepTable(Result):
         return len(self.number)
 
     def _label(self) -> str:
-        return f"{self.name}, {len(self)} points, {len(self.parameters)} parameters, {len(self.metrics)} metrics"
+        counts = {"point": len(self), "parameter": len(self.parameters), "metric": len(self.metrics)}
+        return ", ".join([self.name, *(counted(number, noun) for noun, number in counts.items())])
 
     def _columns(self) -> dict[str, Any]:
         return {name: values for name, (values, _, _) in _columns(self).items()}

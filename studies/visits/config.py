@@ -17,6 +17,7 @@ from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, mode
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, error_context
+from ...core.number_text import counted
 from ...core.schema import Count, Real, Section, Whole, plain_number, validated
 from ...imaging.config import GalaxySourceConfig
 from ...imaging.exposure import Exposure
@@ -148,7 +149,8 @@ class VisitsConfig(Section):
         if visits.from_list is not None:
             listed = read_section(visits.from_list, self.run)
             if len(listed) < count:
-                raise ConfigError(f"visits.count = {count}: expected at most the {len(listed)} visits of the list")
+                most = counted(len(listed), "visit")
+                raise ConfigError(f"visits.count = {count}: expected at most the {most} of the list")
             return listed_plan(listed, _pointing_of(self.run))[:count]
         try:
             return plan_visits(

@@ -29,9 +29,10 @@ from .stack import PsfStack
 
 #: S/N of the weighted flux from which galaxies have a weight in the shear.
 SHEAR_MIN_SNR = 10.0
-#: Sides of stamps [pixel], each drawn on a grid of twice the side: the first that the weight of the shear allows, and
-#: for large galaxies one of at least the second.
-_SIDES = (32, 64, 96, 128)
+#: Sides of stamps [pixel], each drawn on a grid of twice the side: the first that the weight of the shear allows.
+_SIDES = (32, 40, 48, 64, 96, 128)
+#: Least side for large galaxies [pixel].
+_LARGE_SIDE = 64
 #: Half-light radius on the image over which a stamp of the first side is too small [pixel].
 _LARGE = 5.0
 #: Galaxies that are drawn and measured at a time, which bounds the memory.
@@ -177,7 +178,7 @@ def measure_galaxies(
 def stamp_sides(sigma: float) -> tuple[int, int]:
     """Return the sides of stamps of small and of large galaxies for a weight of an rms width, all in pixels."""
     fitting = [side for side in _SIDES if side >= LEAST_SIDE * sigma] or [_SIDES[-1]]
-    return fitting[0], max(fitting[0], _SIDES[1])
+    return fitting[0], max(fitting[0], _LARGE_SIDE)
 
 
 def _row_blocks(rows: np.ndarray) -> Iterator[np.ndarray]:

@@ -13,6 +13,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError, error_context
 from ...core.files import make_folder, write_bytes, write_json
 from ...core.long_work import Execution
+from ...core.number_text import counted
 from ...core.products import Stamp, column, read_fits, table_hdu, write_fits
 from ...core.random_streams import natural_number
 from ...core.units import ARCMIN
@@ -100,18 +101,27 @@ def null_test(
         galaxies_in = source.down_to(faintest := stack_limit(experiment, FAINTEST_SNR, visits))
         covered_tiles = _covered_tiles(stack, cell, config.visits.places)[:tiles]
         if not covered_tiles:
-            raise DomainError(f"{folder}: no part of the sky as large as a CCD was seen by half of {visits} visits")
+            seen_by = counted(visits, "visit")
+            raise DomainError(f"{folder}: no part of the sky as large as a CCD was seen by half of {seen_by}")
         paths = {
             (i, j): folder / "galaxies" / f"visits_{visits:04d}_tile_{i:+03d}_{j:+03d}.fits" for i, j in covered_tiles
         }
         finished = execution.finished(paths, stamp)
         todo = [tile for tile in covered_tiles if tile not in finished]
         depth = _StackMeasurement(stack, frame.matrix, exposure, galaxies_in, seed, cell, reach)
+        # Of the tile of the pointing, to which those of others are alike.
+        tile_size = max(1, len(depth.galaxies_of(covered_tiles[0])))
+        ring_count = len(depth.first_galaxies(covered_tiles, rings))
+        execution.reporter.line(
+            f"{counted(visits, 'visit')}: {counted(len(todo), 'tile')} of about {tile_size} galaxies, "
+            f"{len(_RING_JOBS)} times {counted(ring_count, 'ring galaxy', 'ring galaxies')}"
+        )
         with execution.results(
             measure_job,
             [*(paths[tile].stem for tile in todo), *(f"ring {k}, shear {sign:+.0f}" for k, sign in _RING_JOBS)],
             depth.jobs(todo, covered_tiles, rings),
-            title=f"galaxies in {visits} visits",
+            title=f"galaxies in {counted(visits, 'visit')}",
+            sizes=[tile_size] * len(todo) + [max(1, ring_count)] * len(_RING_JOBS),
         ) as results:
             for tile in todo:
                 write_shapes(paths[tile], next(results), stamp)
@@ -119,10 +129,10 @@ def null_test(
         # Read from the files, as by a resumed test, so that both have the same numbers.
         parts = [read_shapes(path, stamp) for path in paths.values()]
         if (n := sum(int(shapes.usable_twice.sum()) for shapes in parts)) < 2:
-            text = f"{n} of {sum(map(len, parts))} galaxies to magnitude {faintest:.2f} are usable in {visits} visits"
+            galaxies = counted(sum(map(len, parts)), "galaxy", "galaxies")
+            text = f"{n} of {galaxies} to magnitude {faintest:.2f} usable in {counted(visits, 'visit')}"
             raise DomainError(f"{folder}: {text}; expected two or more, of the galaxies of {CONFIG_NAME}")
-        ring_count = len(depth.first_galaxies(covered_tiles, rings))
-        with execution.reporter.stage(f"correlations in {visits} visits"):
+        with execution.reporter.stage(f"correlations in {counted(visits, 'visit')}"):
             psfs = PsfAtGalaxies.of(stack, GalaxyShapes.joined(parts), depth.psf_error_response(covered_tiles))
             biases = ShearBiases(
                 _calibration(frame.matrix, ring_count, measured_rings),
@@ -172,7 +182,7 @@ class _StackMeasurement:
         """Yield the arguments of :func:`measure_galaxies` for tiles, and then for the rings of all tiles."""
         for tile in todo:
             key: tuple[str | int, ...] = ("null test", self.stack.visits, *map(natural_number, tile))
-            yield self._job(self.galaxies_in(*_tile_ranges(tile, self.cell)), key)
+            yield self._job(self.galaxies_of(tile), key)
         galaxies = self.first_galaxies(tiles, rings)
         shear = SHEAR * _shear_along_diagonal(len(galaxies))
         for k, sign in _RING_JOBS:
@@ -180,13 +190,17 @@ class _StackMeasurement:
             sheared = rotated.sheared(sign * shear.real, sign * shear.imag)
             yield self._job(sheared, ("shear", self.stack.visits, k))
 
+    def galaxies_of(self, tile: tuple[int, int]) -> Galaxies | PlantedGalaxies:
+        """Return the galaxies of a tile."""
+        return self.galaxies_in(*_tile_ranges(tile, self.cell))
+
     def first_galaxies(self, tiles: list[tuple[int, int]], count: int) -> Galaxies | PlantedGalaxies:
         """Return so many galaxies, those of the first tiles that have them."""
-        parts = [self.galaxies_in(*_tile_ranges(tiles[0], self.cell))]
+        parts = [self.galaxies_of(tiles[0])]
         for tile in tiles[1:]:
             if sum(map(len, parts)) >= count:
                 break
-            parts.append(self.galaxies_in(*_tile_ranges(tile, self.cell)))
+            parts.append(self.galaxies_of(tile))
         kind: Any = type(parts[0])
         galaxies = kind.concatenate(parts)
         return galaxies.take(np.arange(min(count, len(galaxies))))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.number_text import counted
 from ...core.random_streams import stream
 from ...models.telescope import Telescope
 from ...sky.pointing import Pointing
@@ -163,7 +164,7 @@ def plan_visits(
         raise DomainError(f"dither = {np.rad2deg(dither):g} deg: expected 0 to 5")
     for name, angles_deg in (("roll_deg", rolls_deg), ("rotator_deg", rotators_deg)):
         if angles_deg is not None and not isinstance(angles_deg, str) and len(angles_deg) < count:
-            raise DomainError(f"{name}: {len(angles_deg)} angles for {count} visits, expected one for each")
+            raise DomainError(f"{name}: {len(angles_deg)} angles for {counted(count, 'visit')}, expected one for each")
     visits = []
     for number in range(count):
         rng = stream(seed, "visit", number)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ...core.number_text import counted
 from ...core.plotting import BLUE, GREY, ORANGE, new_figure, png_bytes, styled
 from ...core.units import ARCMIN
 from ...measure.correlation_plots import draw_correlation, log_axes
@@ -53,7 +54,7 @@ def ellipticity_picture(stacks: Mapping[int, PsfStack]) -> bytes:
             draw_whiskers(axes, ends, "black", 0.6)
             axes.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal")
             rms = np.sqrt(np.nanmean(e1**2 + e2**2))
-            axes.set_title(f"{quantity}, {_visits(stack.visits)}: rms |e| {rms:.1e}", loc="left")
+            axes.set_title(f"{quantity}, {counted(stack.visits, 'visit')}: rms |e| {rms:.1e}", loc="left")
             draw_key_whisker(axes, key, scale, 1.0)
             draw_compass(axes, *stack.sky_directions)
         for axes in axes_grid[-1]:
@@ -75,7 +76,7 @@ def correlation_picture(correlated: Mapping[int, StackCorrelations], moments: st
         for axes, (visits, correlations) in zip(panels, correlated.items(), strict=True):
             for kind, style in _STYLES.items():
                 draw_correlation(axes, correlations[f"{kind}{end}"], "plus", *style)
-            log_axes(axes, _visits(visits))
+            log_axes(axes, counted(visits, "visit"))
             axes.set_xlabel("separation [arcmin]")
         name = "g, adaptive moments" if moments == "g" else "weighted e"
         panels[0].set_ylabel(f"$|\\xi_+|$ of {name}: filled positive, open negative")
@@ -100,7 +101,7 @@ def null_test_picture(results: Mapping[int, NullTest]) -> bytes:
                 for kind, style in _GALAXY_STYLES.items():
                     if kind in correlation_of_kind:
                         draw_correlation(axes, correlation_of_kind[kind], "plus", *style)
-                log_axes(axes, f"{method}, {_visits(result.visits)}: {result.density:.0f} usable per arcmin²")
+                log_axes(axes, f"{method}, {counted(result.visits, 'visit')}: {result.density:.0f} usable per arcmin²")
             row[0].set_ylabel("$|\\xi_+|$: filled positive, open negative")
         for axes in panels[-1]:
             axes.set_xlabel("separation [arcmin]")
@@ -123,7 +124,7 @@ def density_picture(results: Mapping[int, NullTest]) -> bytes:
         for result, x, y in zip(results.values(), density, amplitudes, strict=True):
             # Beside the point, towards the middle of the axes.
             ahead, side = (-6, "right") if x > np.sqrt(density.min() * density.max()) else (6, "left")
-            label = _visits(result.visits)
+            label = counted(result.visits, "visit")
             axes.annotate(label, (x, y), xytext=(ahead, -10), textcoords="offset points", ha=side, fontsize=8)
         slope = density_slope(density, amplitudes)
         title = "no slope: fewer than three stacks" if slope is None else f"slope {slope.value:.2f} ± {slope.error:.2f}"
@@ -131,7 +132,3 @@ def density_picture(results: Mapping[int, NullTest]) -> bytes:
         axes.set(xlabel="usable galaxies per arcmin²", ylabel="amplitude")
         axes.legend(loc="best")
         return png_bytes(figure)
-
-
-def _visits(count: int) -> str:
-    return "1 visit" if count == 1 else f"{count} visits"

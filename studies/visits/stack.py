@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
+from ...core.number_text import counted
 from ...core.plotting import figure_at, styled
 from ...core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
 from ...core.result import Result
@@ -169,8 +170,9 @@ class PsfStack(Result):
         """
         rows = np.flatnonzero((sums.count > 0) & (2 * sums.count >= sums.visits))
         if (~star[rows]).sum() < 2 or star[rows].sum() < 2:
+            visits = counted(sums.visits, "visit")
             raise DomainError(
-                f"{len(rows)} stars and places were seen by half of {sums.visits} visits: expected more of them, or "
+                f"{len(rows)} stars and places were seen by half of {visits}: expected more of them, or "
                 "CCDs around the middle of the field, which all rolls see"
             )
         count = sums.count[rows]

@@ -15,6 +15,7 @@ from ...core.errors import DomainError, ProductError
 from ...core.files import make_folder, write_bytes, write_json
 from ...core.long_work import Execution, claim_folder
 from ...core.memory import readable
+from ...core.number_text import counted
 from ...core.products import Stamp, write_ecsv
 from ...core.progress import Reporter
 from ...core.units import ARCSEC
@@ -109,12 +110,14 @@ def stack_visits(
     claim_visits(folder, config, resume=execution.resume)
     sums = _sums_so_far(folder, stamp, len(points), execution.resume)
     if sums.visits > len(visits):
-        raise ProductError(f"{folder} holds {sums.visits} visits: expected at most {len(visits)}; choose another --out")
+        stacked = counted(sums.visits, "visit")
+        raise ProductError(f"{folder} holds {stacked}: expected at most {len(visits)}; choose another --out")
     gone = [n for n in config.kept if n <= sums.visits and not stack_path(folder, n).exists()]
     if gone:
-        raise ProductError(f"{folder} kept no stack of {gone[0]} visits, and has gone on; choose another --out")
+        stacked = counted(gone[0], "visit")
+        raise ProductError(f"{folder} kept no stack of {stacked}, and has gone on; choose another --out")
     if sums.visits:
-        reporter.line(f"{sums.visits} of {len(visits)} visits are stacked already")
+        reporter.line(f"{sums.visits} of {counted(len(visits), 'visit is', 'visits are')} stacked already")
     scale = pixel_scale_of(frame)
     due = visits[sums.visits :]
     # In this process each visit shows its own stages.
@@ -123,7 +126,7 @@ def stack_visits(
         partial(compute_visit, points, frame, reporter if alone else None),
         [visit.label for visit in due],
         ((visit_experiment(experiment, visit), visit) for visit in due),
-        title=None if alone else f"{len(due)} visits",
+        title=None if alone else counted(len(due), "visit"),
         check=lambda processes: check_memory(experiment, threads, copies=processes),
     ) as results:
         for visit, psfs in zip(due, results, strict=True):

@@ -2,17 +2,20 @@
 
 import json
 import re
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from astropy.io import fits
 from astropy.table import Table
 from scipy.ndimage import gaussian_filter
 
 import pachon
-from pachon.commands.cli import main
+from pachon.commands.cli import app, main
 from pachon.commands.donut_inputs import StampFiles
+from pachon.commands.donut_options import SimulationOptions, TelescopeOptions
 from pachon.commands.donut_report import motion_rows
 from pachon.sensing.observatory_zernikes import BodyMotions
 from pachon.sensing.stamp_files import read_stamps
@@ -23,6 +26,11 @@ pytestmark = pytest.mark.usefixtures("empty_pictures")
 ROOT = Path(__file__).parents[2]
 FIELD = (0.6, 0.9)
 OPTIONS = ["--defocus-um", "1500", "--pixel-um", "20", "--zernikes", "11", "--higher-order-nm", "0", "--no-diffraction"]
+
+
+# Words for options that take no number; those of others are 3.
+VALUES = {"out": "a.ecsv", "picture": "a.png", "field_frame": "CCS", "frame": "CCS", "convention": "donut",
+          "projection": "postel", "stamp": "30", "terms": "11"}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -95,11 +103,14 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
     [
         (["missing.fits"], "missing.fits: no such file"),
         (["text.fits"], "text.fits: cannot be read as FITS"),
+        (["a.npy"], "a.npy: array of shape [2, 16] and type float32: expected FITS files of images; pachon.fit_donuts"),
+        (["plain.fits", "--mask", "a.npz"], "a.npz: m of shape [2, 16, 16] and type bool: expected FITS files"),
+        (["object.npy"], "object.npy: no file of plain NumPy arrays: expected FITS files of images"),
         (
             ["plain.fits"],
             "plain.fits: no field angles: expected FIELD_X and FIELD_Y, a table with them, or --field-deg",
         ),
-        (["rows.fits"], "rows.fits: table of 1 rows for 2 stamps: expected one row a stamp"),
+        (["rows.fits"], "rows.fits: table of 1 row for 2 stamps: expected one row a stamp"),
         (["plain.fits", "--field-deg", "1,2,3"], "--field-deg = '1,2,3': expected"),
         (["plain.fits", "-o", "table.txt"], "--out = table.txt: expected a name that ends in"),
         (["plain.fits", "--picture", "a.gif"], "expected a name that ends in .png"),
@@ -109,7 +120,7 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
             ["plain.fits", "--field-deg", "0,1", "--moved", "Mirror"],
             "moved = 'Mirror': expected a group of lsst_v3.3_r (",
         ),
-        (["plain.fits", "--perturb", "M2.dx=1um"], "--perturb, --set: expected them with --simulate"),
+        (["plain.fits", "--perturb", "M2.dx=1um"], "--perturb: expected with --simulate alone"),
         (["new.fits", "--simulate"], "--defocus-um = 0: expected a shift that makes donuts"),
         (["new.fits", "--simulate", "--perturb", "M2.dx"], "--perturb = 'M2.dx': expected a parameter and its change"),
         (
@@ -120,6 +131,10 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
         (["new.fits", "--simulate", "--set", "star=2"], "--set: unknown key star = 2"),
         (["new.fits", "--simulate", "--set", "stars"], "--set 'stars': expected KEY=VALUE"),
         (["new.fits", "--simulate", "--rotator-deg", "30", "-o", "a.ecsv"], "--rotator-deg, --out: expected without"),
+        (["new.fits", "--simulate", "--json"], "--json: expected without --simulate"),
+        (["plain.fits", "--field-deg", "0,0", "--site", "nowhere"], "unknown site 'nowhere'"),
+        (["plain.fits", "--field-deg", "0,0", "--exposure-s", "15", "--site", "nowhere"], "unknown site 'nowhere'"),
+        (["plain.fits", "--each-alone", "--degrees-of-freedom", "lsst"], "--each-alone and --degrees-of-freedom: exp"),
         (["new.txt", "--simulate"], "new.txt: --simulate: expected one FILE.fits"),
         (["plain.fits", "--frame", "XYZ"], "--frame = 'XYZ': expected"),
         (["plain.fits", "--field-frame", "ocs"], "--field-frame = 'ocs': expected"),
@@ -128,7 +143,7 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
         (["plain.fits", "--rotator-deg", "nan"], "--rotator-deg = nan: expected a finite number of degrees"),
         (["plain.fits", "--frame", "sky"], "frame sky without a parallactic angle: expected --parallactic-deg"),
         (["plain.fits", "--gain", "0", "--field-deg", "0,0"], "--gain = 0.0: expected electrons of a unit, above 0"),
-        (["plain.fits", "--mask", "rows.fits", "--field-deg", "0,0"], "1 of shape [3, 16, 16] for 1 images of [2, 16"),
+        (["plain.fits", "--mask", "rows.fits", "--field-deg", "0,0"], "1 of shape [3, 16, 16] for 1 image of [2, 16"),
         (["plain.fits", "plain.fits", "--mask", "plain.fits"], "for 2 files: expected one file of stamps with it"),
         (
             ["plain.fits", "--defocus-um", "nan", "--field-deg", "0,0"],
@@ -146,6 +161,9 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
 def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, part):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "text.fits").write_text("no FITS at all\n")
+    np.save("a.npy", np.zeros((2, 16), np.float32))
+    np.save("object.npy", np.array([None]))
+    np.savez("a.npz", m=np.zeros((2, 16, 16), bool))
     fits.PrimaryHDU(np.zeros((2, 16, 16))).writeto("plain.fits")
     table = fits.BinTableHDU(Table({"field_x": [0.0], "field_y": [0.0]}))
     fits.HDUList([fits.PrimaryHDU(np.zeros((2, 16, 16))), table]).writeto("rows.fits")
@@ -329,14 +347,57 @@ def test_tables_have_one_unit_in_every_frame(tmp_path, monkeypatch, stamp):
     monkeypatch.chdir(tmp_path)
     header = fits.Header({"FIELD_X": FIELD[0], "FIELD_Y": FIELD[1]})
     fits.PrimaryHDU(stamp, header).writeto("d.fits")
-    for frame in ("OCS", "CCS"):
-        arguments = ["donuts", "d.fits", *OPTIONS, "--quiet", "--frame", frame, "--no-orientation-check"]
-        assert main([*arguments, "-o", f"{frame}.ecsv"]) == 0
-    telescope, camera = (Table.read(f"{frame}.ecsv") for frame in ("OCS", "CCS"))
-    assert camera["Z5"].unit == camera["Z5_err"].unit == telescope["Z5"].unit == "nm"
+    for table in ("OCS.csv", "CCS.ecsv"):
+        arguments = ["donuts", "d.fits", *OPTIONS, "--quiet", "--frame", table[:3], "--no-orientation-check"]
+        assert main([*arguments, "-o", table]) == 0
+    telescope, camera = Table.read("OCS.csv"), Table.read("CCS.ecsv")
+    assert telescope.colnames[:2] == ["field_x [deg]", "field_y [deg]"]
+    assert camera["Z5"].unit == camera["Z5_err"].unit == "nm"
     assert camera.meta["zernike_unit"] == "nm"
     for name in ("Z4", "Z5", "Z8", "Z8_err"):
-        assert camera[name][0] == pytest.approx(telescope[name][0], rel=1e-9)
+        assert camera[name][0] == pytest.approx(telescope[f"{name} [nm]"][0], rel=1e-9)
+
+
+def test_simulations_refuse_all_options_of_fits_and_fits_those_of_simulations(tmp_path, monkeypatch, capsys):
+    """An option that neither uses would be ignored."""
+    monkeypatch.chdir(tmp_path)
+    of_both = {f.name for f in fields(TelescopeOptions)}
+    of_simulations = {f.name for f in fields(SimulationOptions)}
+    command = typer.main.get_command(app).commands["donuts"]
+    options = {p.name: p for p in command.params if p.param_type_name == "option"}
+    assert len(options) > 35
+    for name, option in options.items():
+        value = [] if option.is_flag else [VALUES.get(name, "3")]
+        given = (option.secondary_opts or option.opts)[0] if option.default is True else option.opts[0]
+        simulate = [] if name in of_simulations else ["--simulate"]
+        if name in of_both or name == "simulate":
+            continue
+        assert main(["donuts", "no.fits", *simulate, given, *value]) == 2
+        expected = "expected with --simulate alone" if name in of_simulations else "expected without --simulate"
+        assert capsys.readouterr().err == f"pachon: error: {option.opts[0]}: {expected}\n"
+
+
+def interrupted(*_, **__):
+    raise KeyboardInterrupt
+
+
+def test_an_interrupted_fit_says_that_nothing_is_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    fits.PrimaryHDU(np.zeros((2, 16, 16))).writeto("plain.fits")
+    monkeypatch.setattr("pachon.sensing.fit.fit_donuts", interrupted)
+    assert main(["donuts", "plain.fits", "--field-deg", "0,1", "--defocus-um", "1500", "-o", "a.ecsv"]) == 130
+    error = "pachon: error: interrupted; nothing is written before all donuts are fitted\n"
+    assert capsys.readouterr().err == error
+    assert not (tmp_path / "a.ecsv").exists()
+
+
+def test_a_defocus_beside_that_of_the_file_is_said(tmp_path, monkeypatch, capsys):
+    """With that of the file given once more, no donut of a simulated file fitted."""
+    monkeypatch.chdir(tmp_path)
+    fits.PrimaryHDU(np.zeros((2, 16, 16)), fits.Header({"DEFOC_UM": 1500.0})).writeto("plain.fits")
+    monkeypatch.setattr("pachon.sensing.fit.fit_donuts", interrupted)
+    assert main(["donuts", "plain.fits", "--field-deg", "0,1", "--defocus-um", "1500"]) == 130
+    assert "--defocus-um = 1500 is added to the defocus of the files, 1500 um\n" in capsys.readouterr().err
 
 
 def test_motions_that_were_not_fitted_are_dashes():

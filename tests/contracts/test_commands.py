@@ -82,7 +82,7 @@ def options_of(command):
 def annotation_of(command, name):
     """Type of a parameter as its function has it, in words."""
     function = inspect.unwrap(command.callback)
-    annotation = inspect.signature(function).parameters[name].annotation
+    annotation = inspect.signature(command.callback).parameters[name].annotation
     return str(eval(annotation, function.__globals__) if isinstance(annotation, str) else annotation)
 
 

@@ -114,6 +114,14 @@ def test_results_keep_the_order_of_the_jobs(workers, title):
     assert squares([], workers, title=title) == []
 
 
+def test_progress_counts_the_items_of_jobs(capsys):
+    with Execution(reporter=Reporter()).results(square, ["a", "b"], [1, 2], title="t", sizes=[9, 1]) as results:
+        assert list(results) == [1, 4]
+    first, second, _ = capsys.readouterr().err.splitlines()
+    assert first.startswith("a (9 of 10, ")
+    assert second == "b (10 of 10)"
+
+
 def test_a_result_is_there_before_the_jobs_after_it_are_computed():
     taken = []
 

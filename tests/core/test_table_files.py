@@ -1,10 +1,12 @@
-"""Tables as Parquet: numbers of any byte order, text, truth values, rows of several numbers, units and descriptions."""
+"""Tables of files: units in names of columns; Parquet's byte orders, text, truth values, rows of several numbers."""
 
 import numpy as np
 import pytest
+from astropy import units as u
+from astropy.table import QTable
 
 from pachon.core.errors import ConfigError
-from pachon.core.table_files import parquet_bytes
+from pachon.core.table_files import in_format_of, parquet_bytes, read_columns, write_table
 
 pyarrow = pytest.importorskip("pyarrow")
 
@@ -27,3 +29,23 @@ def test_columns_and_their_words_are_those_given(tmp_path):
     assert table.schema.field("a").metadata == {b"unit": b"um", b"description": b"numbers of FITS"}
     assert table.schema.field("n").metadata is None
     assert table.schema.metadata == {b"pachon": b"1"}
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet", "ecsv", "fits"])
+def test_units_are_read_again(tmp_path, ending):
+    path = tmp_path / f"t.{ending}"
+    table = QTable({"Z4": [1.5, 2.5] * u.nm, "slope": [1.0, 2.0] * u.electron / u.pix**2, "n": [3, 4], "w": [0.5, 1.0]})
+    table["w"].unit = u.dimensionless_unscaled
+    write_table(path, in_format_of(path, table))
+    columns = read_columns(path)
+    assert (columns["z4"].unit, columns["slope"].unit) == (u.nm, u.electron / u.pix**2)
+    assert columns["z4"].tolist() == [1.5, 2.5]
+    assert {"n", "w"} <= set(columns)
+
+
+def test_names_that_units_would_change_are_kept(tmp_path):
+    """Bands and numbers in brackets are none, and a column has its own name first."""
+    path = tmp_path / "t.csv"
+    headings = ("mag [g]", "mag [r]", "flux [1]", "x", "x [deg]", "[m]", "a [no such unit]")
+    path.write_text(",".join(headings) + "\n" + ",".join("1234567") + "\n")
+    assert tuple(read_columns(path)) == headings

@@ -81,3 +81,5 @@ def test_what_is_nothing_to_show_is_one_line(tmp_path):
         pachon.open_desk(tmp_path)
     with pytest.raises(UnknownNameError):
         pachon.open_desk("lsst_v3.3_rr")
+    with pytest.raises(ProductError, match=r"gone.sweep: no such file"):
+        pachon.open_desk(tmp_path / "gone.sweep")

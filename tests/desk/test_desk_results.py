@@ -11,6 +11,7 @@ from astropy.table import QTable
 import pachon
 from pachon.core.errors import DomainError, ProductError
 from pachon.core.products import Stamp
+from pachon.core.table_files import in_format_of, write_table
 from pachon.desk.donut_views import DonutBench, DonutStamps
 from pachon.desk.tolerance_views import ToleranceBench
 from pachon.desk.visit_views import STACK_KINDS, NightBench, StackBench
@@ -140,12 +141,14 @@ def test_stamps_of_donuts_are_image_model_and_difference(tmp_path):
     assert bench.images(2) is None
 
 
-def test_zernikes_of_a_table_in_micrometres_are_shown_in_nanometres(tmp_path):
+@pytest.mark.parametrize("ending", ["ecsv", "csv"])
+def test_zernikes_of_a_table_in_micrometres_are_shown_in_nanometres(tmp_path, ending):
     path = donut_table(tmp_path / "donuts.ecsv")
     expected, table = DonutBench.read(path).zernikes, QTable.read(path)
     for name in ("Z4", "Z4_err", "Z5", "Z5_err"):
         table[name] = table[name].to(u.um)
-    table.write(path, overwrite=True)
+    path = path.with_suffix(f".{ending}")
+    write_table(path, in_format_of(path, table))
     np.testing.assert_allclose(DonutBench.read(path).zernikes, expected, rtol=1e-6)
 
 

@@ -244,7 +244,7 @@ def test_who_wants_no_progress_hears_of_a_ccd_left_out(settings_file, tmp_path, 
 
 @pytest.mark.long
 def test_a_run_of_which_no_ccd_can_be_modelled_is_one_line(tmp_path, tiny, failing_ccd):
-    with pytest.raises(DomainError, match=r"^none of 1 CCDs can be modelled; CCD R22_S11: 3 of 12 stars left"):
+    with pytest.raises(DomainError, match=r"^none of 1 CCD can be modelled; CCD R22_S11: 3 of 12 stars left"):
         run(tiny(ccds=("R22_S11",)), tmp_path / "out")
 
 

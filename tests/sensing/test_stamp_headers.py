@@ -192,9 +192,7 @@ def test_wrong_headers_are_one_line(tmp_path, focused, cards, part):
 def test_wrong_planes_are_one_line(tmp_path):
     image = np.ones((12, 12), np.float32)
     fits.HDUList([fits.PrimaryHDU(image), fits.ImageHDU(image[:6], name="DQ")]).writeto(tmp_path / "a.fits")
-    with pytest.raises(
-        ProductError, match=r"planes of mask: 1 of shape \[6, 12\] for 1 images of \[12, 12\]: expected"
-    ):
+    with pytest.raises(ProductError, match=r"planes of mask: 1 of shape \[6, 12\] for 1 image of \[12, 12\]: expected"):
         read_stamps(tmp_path / "a.fits")
 
 

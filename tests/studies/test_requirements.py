@@ -221,7 +221,7 @@ def test_commands(tmp_path, monkeypatch, capsys):
     assert "limit = 'spot': expected NAME < AMOUNT" in capsys.readouterr().err
     assert not Path("b.baseline.json").exists()
     assert main([*save, "--limit", "spot rms > 1 m", "--quiet"]) == 0
-    assert "1 metrics are beyond their limits, such as spot rms" in capsys.readouterr().err
+    assert "1 metric is beyond their limits, such as spot rms" in capsys.readouterr().err
     assert main(["check", "b.baseline.json", "--json"]) == 1
     found = json.loads(capsys.readouterr().out)["baselines"][0]
     assert found["causes"] == {BROKEN: 1}

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from ....core.errors import DomainError
 from ....core.files import write_bytes, write_json
 from ....core.long_work import Execution
+from ....core.number_text import counted
 from ....core.products import Stamp
 from ....core.random_streams import natural_number, stream
 from ....core.units import ARCMIN
@@ -121,7 +122,7 @@ def measure_stack(
 
     tiles: dict[int, list[MeasuredTile]] = {visits: [] for visits in stack.visits.kept}
     left_out: dict[int, dict[str, str]] = {visits: {} for visits in stack.visits.kept}
-    labels = [f"{visits} visits, tile {tile.name}" for visits, tile in numbered]
+    labels = [f"{counted(visits, 'visit')}, tile {tile.name}" for visits, tile in numbered]
     with execution.results(
         partial(measured_or_reason, stack), labels, jobs(), title="galaxies in the stacked images"
     ) as results:

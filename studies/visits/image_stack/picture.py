@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ....core.number_text import counted
 from ....core.plotting import new_figure, png_bytes, styled
 from ....imaging.image_file import CcdImage
 from ....imaging.scene import CUTOUT
@@ -20,7 +21,7 @@ def stacks_png(images: dict[int, CcdImage]) -> bytes:
             y, x = ((n - side) // 2 for n in image.image.shape)
             noise = float(np.sqrt(np.median(image.variance[image.mask == 0])))
             show_stretched(axes, image.image[y : y + side, x : x + side], noise, scale)
-            axes.set_title(f"{visits} visit{'s' if visits > 1 else ''}, {image.header['EXPTIME']:g} s", loc="left")
+            axes.set_title(f"{counted(visits, 'visit')}, {image.header['EXPTIME']:g} s", loc="left")
             if axes.get_subplotspec().is_first_col():
                 draw_compass(axes, image.header)
             else:

@@ -12,6 +12,7 @@ import numpy as np
 from ....core.errors import DomainError, ProductError, error_context
 from ....core.long_work import Execution, claim_folder
 from ....core.memory import readable, require_bytes
+from ....core.number_text import counted
 from ....core.products import is_whole
 from ....core.progress import Reporter
 from ....core.units import ARCSEC
@@ -76,16 +77,17 @@ def stack_images(
     sums = {tile: _sums_so_far(stack, tile, execution.resume) for tile in stack.tiles}
     done = min(s.visits for s in sums.values())
     if max(s.visits for s in sums.values()) > len(plan):
-        raise ProductError(f"{stack.folder} holds more than the {len(plan)} visits of {folder}; remove one of them")
+        most = counted(len(plan), "visit")
+        raise ProductError(f"{stack.folder} holds more than the {most} of {folder}; remove one of them")
     for tile, sums_of_tile in sums.items():
         gone = [
             n for n in stack.visits.kept if n <= sums_of_tile.visits and not is_whole(stack.path(n, tile), stack.stamp)
         ]
         if gone:
-            text = f"has no image of {gone[0]} visits of tile {tile.name}, and has gone on; remove it"
+            text = f"has no image of {counted(gone[0], 'visit')} of tile {tile.name}, and has gone on; remove it"
             raise ProductError(f"{stack.folder} {text}")
     if done:
-        reporter.line(f"images of {done} of {len(plan)} visits are stacked already")
+        reporter.line(f"images of {done} of {counted(len(plan), 'visit is', 'visits are')} stacked already")
     alone, due = execution.alone, plan[done:]
     before = {tile: sums_of_tile.visits for tile, sums_of_tile in sums.items()}
     with execution.results(
@@ -96,7 +98,7 @@ def stack_images(
             (visit, visit_experiment(stack.experiment, visit), wcs, [t for t in sums if before[t] <= visit.number])
             for visit, wcs in stack.wcs(due, threads)
         ),
-        title=None if alone else f"images of {len(due)} visits",
+        title=None if alone else f"images of {counted(len(due), 'visit')}",
         check=lambda processes: _check_memory(stack, threads, processes),
     ) as results:
         for visit_sums in results:
@@ -123,7 +125,7 @@ def draw_visit(
     touched = {name: window_on(tiles, stack.frame, ccd_wcs) for name, ccd_wcs in wcs.items()}
     windows = {name: window for name, window in touched.items() if window is not None}
     exposure, sums = stack.exposure(), {tile: TileSums.empty(tile.side) for tile in tiles}
-    bar = reporter.stage(f"images of {len(windows)} CCDs", total=len(windows))
+    bar = reporter.stage(f"images of {counted(len(windows), 'CCD')}", total=len(windows))
     with experiment.screens(threads, reporter), bar as stage:
         for i, (name, window) in enumerate(windows.items(), start=1):
             visit_wcs, depth = wcs[name], stack.visits.visits.count

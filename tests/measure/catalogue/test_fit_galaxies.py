@@ -353,7 +353,7 @@ DOT = np.ones((1, 1))
         ({"psf_images": np.full((4, 4), 1 / 16)}, "odd m"),
         ({"psf_images": np.full((3, 3), 0.1)}, r"psf_images\[0\] has a sum of 0.9: expected 1"),
         ({"psf_images": np.full((3, 3), np.nan)}, "has a sum of nan"),
-        ({"psf_images": np.ones((2, 1, 1))}, "psf_images: 2 for 1 galaxies"),
+        ({"psf_images": np.ones((2, 1, 1))}, "psf_images: 2 for 1 galaxy"),
         ({"psf_index": [1]}, "psf_index: 1 to 1, expected 0 to 0"),
         ({"psf_index": [0.0]}, r"psf_index has shape \(1,\) and type float64: expected 1 integers"),
     ],

@@ -90,7 +90,7 @@ def test_galaxies_of_unequal_numbers_by_patch():
 def test_bad_input_is_one_line():
     rng = np.random.default_rng(5)
     shapes = shapes_of((0.0, 0.0), responses(10, rng), rng, 0.1)
-    with pytest.raises(DomainError, match="1 galaxies, expected at least two"):
+    with pytest.raises(DomainError, match="1 galaxy, expected at least two"):
         pachon.measure.mean_shear(shapes.take([0]))
     with pytest.raises(DomainError, match="patch: 1 different, expected at least two"):
         pachon.measure.mean_shear(shapes, patch=np.zeros(10, dtype=int))

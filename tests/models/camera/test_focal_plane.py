@@ -286,7 +286,7 @@ def test_table_and_mesh_round_trip():
         ({"x": [0.0], "y": [0.0]}, "column 'z' is missing"),
         ({"x": [0.0], "y": [0.0], "z": [np.nan]}, "column 'z', row 0 = nan: expected finite numbers"),
         ({"x": [0.0, 1.0], "y": [0.0], "z": [0.0]}, "expected one length"),
-        ({"x": [1.0], "y": [0.0], "z": [0.0]}, "none of 1 points lies on a CCD"),
+        ({"x": [1.0], "y": [0.0], "z": [0.0]}, "none of 1 point lies on a CCD"),
         ({"x": [0.0, 0.001], "y": [0.0, 0.0], "z": [0.0, 0.0]}, "heights on R22_S11: 2 points: expected at least 3"),
         ({"x": [0.0, 1e-3, 2e-3], "y": [0.0] * 3, "z": [0.0] * 3}, "heights on R22_S11: 3 points: .* not on one line"),
         ({"x": ["a"], "y": [0.0], "z": [0.0]}, "heights column 'x'"),

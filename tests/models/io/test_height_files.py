@@ -234,7 +234,7 @@ UNITS = {"x": "mm", "y": "mm", "z": "um"}
         (Table({"x": [1.0], "y": [1.0], "z": [1.0]}), ["column x in no unit", "a unit of length"]),
         (Table({"x": [1.0], "y": [1.0], "z": [1.0]}, units=UNITS | {"z": "deg"}), ["column z in deg"]),
         (Table({"x": [1.0, np.nan], "y": [1.0, 2.0], "z": [1.0, 1.0]}, units=UNITS), ["x, row 1: expected finite"]),
-        (Table({"x": [9e9], "y": [1.0], "z": [1.0]}, units=UNITS), ["none of 1 points lies on a CCD"]),
+        (Table({"x": [9e9], "y": [1.0], "z": [1.0]}, units=UNITS), ["none of 1 point lies on a CCD"]),
         (Table({"x": [1.0], "y": [1.0], "z": [1.0]}, units=UNITS, meta={"frame": "DVCS"}), ["frame = 'DVCS'", "CCS"]),
         (zernike_table(unit=None), ["column ORIGIN_X in no unit"]),
         (zernike_table(ZK=None), ["column ZK is missing"]),

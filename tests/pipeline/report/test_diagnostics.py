@@ -216,7 +216,7 @@ def test_why_a_ccd_was_not_modelled_is_told_again(run_copy, no_pictures, capsys)
     (run_copy / "summary.json").write_text(json.dumps({**summary, "not_modelled": {CCDS[1]: "too few stars"}}))
     assert diagnose(run_copy).missing == {CCDS[1]: f"CCD {CCDS[1]}: too few stars"}
     assert main(["diagnose", str(run_copy)]) == 0
-    assert f"1 CCDs are left out; the first: CCD {CCDS[1]}: too few stars" in capsys.readouterr().out
+    assert f"1 CCD is left out; the first: CCD {CCDS[1]}: too few stars" in capsys.readouterr().out
     assert main(["diagnose", str(run_copy), "--strict"]) == 2
     assert capsys.readouterr().err == f"pachon: error: CCD {CCDS[1]}: too few stars\n"
 

@@ -336,7 +336,7 @@ def test_ccds_without_stars_are_predicted_and_remarked(exposure):
     gone = exposure.camera.ccd_index("R23_S02")
     model = FocalPlanePsf.fit(exposure.stars(exposure.first & (exposure.ccd != gone)), camera=exposure.camera)
     (remark,) = [w for w in model.warnings if "without stars" in w]
-    assert remark.startswith("1 CCDs")
+    assert remark.startswith("1 CCD ")
     assert "R23_S02" in remark
     h = ~exposure.first & (exposure.ccd == gone)
     where = ("R23_S02", *exposure.xy[h].T)

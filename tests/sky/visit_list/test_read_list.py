@@ -274,6 +274,15 @@ def test_a_condition_can_only_read_columns(write_list, where):
         read_visit_list(write_list(), where=where)
 
 
+@pytest.mark.parametrize("where", ['"nosuch" > 1', 'observationId > 0 AND "no""such" > 1', '/* " */ "nosuch" > 1 -- "'])
+def test_a_name_in_double_quotes_is_that_of_a_column(write_list, where):
+    """SQLite takes one that no column has for a text, which is greater than any number."""
+    with pytest.raises(ConfigError, match=r"no such column: no.?such; expected .*, observationstartmjd"):
+        read_visit_list(write_list(), where=where)
+    columns_and_text = """ "observationId" = 1004 AND '"nosuch"' < "band" COLLATE "nocase" -- "nosuch" """
+    assert read_visit_list(write_list(), where=columns_and_text).visit.tolist() == [1004]
+
+
 def test_a_database_is_not_changed(write_database):
     path = write_database("observations", {name: column(name) for name in COLUMNS})
     before = path.read_bytes()
@@ -360,6 +369,8 @@ def changed(name, index, value):
         (changed("fieldDec", 0, 70.0), "visit 1001: altitude = -1"),
         (changed("fieldDec", 0, 95.0), "visit 1001: fielddec = 95 deg: expected -90 to 90 deg"),
         (changed("visitExposureTime", 0, -3.0), "visit 1001: visitexposuretime = -3 s: expected a time above 0 s"),
+        (changed("numExposures", 1, 1.5), "visit 1002: numexposures = 1.5: expected a whole number"),
+        (changed("numExposures", 1, -1), "visit 1002: numexposures = -1: expected a whole number"),
         (changed("observationId", 1, 3.5), "expected whole numbers from 0"),
         (changed("observationId", 1, 1e20), "column observationid, row 2: 1e+20: expected whole numbers from 0"),
         (changed("fieldRA", 1, "12h"), "column fieldra, row 2: '12h': expected a number"),

@@ -1,6 +1,7 @@
 """Nights of visit lists: what comes out, with what bytes, and what is said of visits that fail."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from pachon.core.errors import ConfigError, DomainError, ProductError
 from pachon.core.long_work import Execution
 from pachon.core.products import read_fits
 from pachon.pipeline.listed_visit import check_bands
+from pachon.studies.night.maps import NightMaps
 from pachon.studies.night.night import run_night
 from pachon.studies.night.visit_product import VisitWork
 
@@ -137,6 +139,25 @@ def test_workers_parts_and_interruptions_leave_the_same_bytes(night, night_confi
     assert content(tmp_path / "killed") == files
 
 
+def test_visits_without_products_of_ccds_are_made_anew(night, tmp_path, monkeypatch):
+    """Their own files were taken for all of them."""
+    config, result, files = night
+    folder = tmp_path / "night"
+    shutil.copytree(result.folder, folder)
+    lost, damaged = (folder / "visits" / f"visit_{visit}_ccd_R22_S11.fits" for visit in (1001, 1003))
+    lost.unlink()
+    damaged.write_bytes(damaged.read_bytes()[:-2880])
+    computed = []
+    compute = VisitWork.compute_here
+    monkeypatch.setattr(VisitWork, "compute_here", lambda *work: computed.append(work[2].visit) or compute(*work))
+    monkeypatch.setattr(NightMaps, "write", lambda *_: None)
+    monkeypatch.setattr("pachon.studies.night.night_files.night_page", lambda *_: "")
+    run_night(config, folder, execution=Execution(resume=True))
+    assert computed == [1001, 1003]
+    of_visits = {Path(name).name: data for name, data in files.items() if name.startswith("visits/")}
+    assert content(folder / "visits") == of_visits
+
+
 def test_a_list_that_has_changed_is_refused(night, night_config):
     config, result, _ = night
     path = config.visits.list
@@ -155,7 +176,7 @@ def test_a_list_that_has_changed_is_refused(night, night_config):
 
 
 def test_bands_that_the_telescope_has_not(night_config, tmp_path):
-    with pytest.raises(ConfigError, match=r"band i, 1 visits of visits.csv: .*has no band i"):
+    with pytest.raises(ConfigError, match=r"band i, 1 visit of visits.csv: .*has no band i"):
         run_night(night_config({"telescope": "comcam_r", "ccds": None}), tmp_path / "night")
     assert not (tmp_path / "night").exists()
 

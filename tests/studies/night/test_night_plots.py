@@ -29,3 +29,20 @@ def test_single_pixels_are_seen_on_a_wide_sky(monkeypatch, apart):
         assert width.get_xlim()[0] > width.get_xlim()[1]
     np.testing.assert_allclose(np.sort(places[:, 1]), np.sort(dec))
     assert {tuple(drawn.get_clim()) for drawn in width.collections if drawn.get_array() is not None} == {(1.5, 2.0)}
+
+
+def test_maps_of_one_value_in_one_strip_can_be_read(monkeypatch):
+    """Panels were lines beside tall colour bars, with fractions of visits."""
+    healsparse = pytest.importorskip("healsparse")
+    content = healsparse.HealSparseMap.make_empty(32, 512, dtype=np.float64)
+    content.update_values_pos(np.array([5.0, 12.0, 19.0]), np.full(3, -30.0), np.ones(3))
+    monkeypatch.setattr(plots, "png_bytes", lambda figure: figure.draw_without_rendering() or figure)
+    figure = plots.maps_plot(SimpleNamespace(bands={"r": None}, pictured=lambda band: (content,) * 3))
+    labels = []
+    for panel in figure.axes:
+        (bar,) = panel.child_axes
+        sides, bar_sides = panel.get_window_extent(), bar.get_window_extent()
+        assert sides.height == pytest.approx(0.5 * sides.width, rel=0.01)
+        assert bar_sides.height == pytest.approx(sides.height)
+        labels.append([text.get_text() for text in bar.get_yticklabels()])
+    assert labels == [["1"], ["1"], ["0", "1"]]

@@ -14,7 +14,7 @@ from pachon.measure.shear.shear_shapes import ShearShapes
 from pachon.measure.shear.shear_shapes import shear_bias as shear_bias_of_functionals
 from pachon.sky.galaxies import Galaxies
 from pachon.studies.visits import null_test as module
-from pachon.studies.visits.galaxy_shapes import GalaxyShapes, measure_galaxies
+from pachon.studies.visits.galaxy_shapes import GalaxyShapes, measure_galaxies, stamp_sides
 from pachon.studies.visits.null_result import AdditiveBias, density_slope, shear_bias
 from pachon.studies.visits.null_test import ellipticity_along, null_test, read_shapes, write_shapes
 from pachon.studies.visits.psf_errors import PsfAtGalaxies
@@ -101,6 +101,22 @@ def test_a_wrong_psf_moves_ellipticities_and_the_true_one_does_not():
     # Each galaxy has the same noise twice: the shift is known far better than the ellipticities.
     assert shift.std() < 0.3 * found.e1[both].std()
     assert abs((found.e2 - found.true_e2)[both].mean()) < 2e-3
+
+
+def test_stamps_are_hardly_larger_than_the_weight_needs(monkeypatch):
+    """A weight that needs 33 pixels had 64, four times as many as one that needs 32, for the same shapes."""
+    assert [stamp_sides(needed / 12.0) for needed in (32, 33, 41, 49, 99, 999)] == [
+        *((32, 64), (40, 64), (48, 64), (64, 64), (128, 128), (128, 128))
+    ]
+    psf, many = gaussian(0.03 - 0.02j, 2.3), galaxies(40, sersic=1.0)
+    shapes = []
+    for sides in ((40,), (128,)):
+        monkeypatch.setattr("pachon.studies.visits.galaxy_shapes.stamp_sides", lambda _, sides=sides: 2 * sides)
+        shapes.append(measure_galaxies(stack_of(psf, psf), AXES, many, Exposure(noise=False), 1, reach=ARCMIN))
+    found, wide = shapes
+    # Of an exponential galaxy of 0.8 arcsec two thousandths of the light lie beyond 20 pixels.
+    np.testing.assert_allclose(found.true_e1 + 1j * found.true_e2, wide.true_e1 + 1j * wide.true_e2, atol=1e-3)
+    np.testing.assert_allclose(found.true_shear.e1, wide.true_shear.e1, atol=1e-4)
 
 
 def test_small_galaxies_and_those_far_from_a_known_psf_are_left_out():

@@ -127,7 +127,7 @@ def test_an_interrupted_stack_ends_with_the_same_bytes(visits_folder, backwards,
     stack_images(others, settings, execution=Execution(workers=backwards))
     assert files(others) == files(whole)
     (whole / "images" / "stack_0001_tile_+00_+00.fits").unlink()
-    with pytest.raises(ProductError, match=r"no image of 1 visits of tile \+00_\+00, and has gone on"):
+    with pytest.raises(ProductError, match=r"no image of 1 visit of tile \+00_\+00, and has gone on"):
         stack_images(whole, settings, execution=Execution(resume=True))
 
 
