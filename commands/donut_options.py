@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from ..models.telescope import Telescope
     from ..raytrace.rays import Projection as FieldProjection
     from ..sensing.frames import DonutFrames, FrameName
-    from ..sensing.observatory_zernikes import ZernikeConvention
     from ..sensing.model import DonutAir
+    from ..sensing.observatory_zernikes import ZernikeConvention
     from ..sensing.stamp_headers import HeaderValues
 
 #: Panels of the help.
