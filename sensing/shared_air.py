@@ -11,6 +11,8 @@ from ..models.telescope import Telescope
 _COMMON = 0.5
 #: Least speed of the wind [m/s]: slower air stays in front of the pupil.
 _LEAST_SPEED = 1.0
+#: Least and greatest part, whatever the layers are: fits need a part of either kind.
+_BOUNDS = (0.05, 0.95)
 
 
 def shared_air(telescope: Telescope, site: Site) -> float:
@@ -22,4 +24,5 @@ def shared_air(telescope: Telescope, site: Site) -> float:
     """
     variance = np.array(site.weights) / np.maximum(site.wind_speeds, _LEAST_SPEED)
     apart = np.array(site.altitudes) * telescope.field_radius
-    return float(variance[apart <= _COMMON * telescope.pupil_diameter].sum() / variance.sum())
+    shared = variance[apart <= _COMMON * telescope.pupil_diameter].sum() / variance.sum()
+    return float(np.clip(shared, *_BOUNDS))

@@ -30,6 +30,14 @@ def test_donuts_of_a_narrow_field_share_the_air_of_more_layers():
     assert 0.1 < shared_air(narrow, site) - shared_air(wide, site) < 0.3
 
 
+@pytest.mark.parametrize(("altitude", "expected"), [(0.0, 0.95), (9e3, 0.05)])
+def test_air_in_one_layer_is_neither_all_shared_nor_not_at_all(altitude, expected):
+    site = replace(
+        load_site("cerro_pachon"), altitudes=(altitude,), weights=(1.0,), wind_speeds=(0.0,), wind_directions=()
+    )
+    assert shared_air(pachon.load_telescope("lsst_v3.3_r"), site) == expected
+
+
 def test_site_of_the_fit_is_that_of_the_telescope_unless_it_is_given():
     telescope = pachon.load_telescope("hsc")
     assert pachon.DonutAir().layers(telescope) == load_site("maunakea")
