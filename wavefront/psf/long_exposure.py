@@ -293,7 +293,7 @@ class LongExposureRenderer(PsfRenderer):
 
     def _ray_counts(self, optics: PupilOptics) -> np.ndarray:
         """Return the number of rays of each star far from focus, 0 near it, shape [n_star] int."""
-        return ray_counts(optics, self._plane.pixel_size)
+        return ray_counts(optics, self._plane.pixel_size, self.focal_length)
 
     def _expose_rays(self, rays: int, stars: Stars) -> ExposedStars:
         """Expose stars far from focus by a number of rays."""
