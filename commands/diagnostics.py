@@ -182,7 +182,7 @@ def attribute_command(
     from ..core.files import make_folder
     from ..pipeline.report.tables import ATTRIBUTION_CAPTION, ATTRIBUTION_COLUMNS, attribution_rows
     from ..studies.attribution.attribution import attribute
-    from ..studies.attribution.causes import checked_causes
+    from ..studies.attribution.causes import always_on, checked_causes
     from ..studies.attribution.product import write_attribution
 
     ccd_names = one_name_list(ccds=ccds, raft=raft)
@@ -207,6 +207,8 @@ def attribute_command(
         return
     if not quiet:
         rows.show()
+        for name, reason in always_on(resolved).items() if causes is None else ():
+            print_line(f"{name} is on in all cases: {reason}")
     if result.left_out:
         print_line(f"left out of all cases, not to be modelled in one: {', '.join(result.left_out)}")
     print_line(f"attribution: {out.resolve()}")

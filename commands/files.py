@@ -75,7 +75,7 @@ def new_command(
 def validate_command(
     files: Annotated[list[Path], Argument(metavar="FILE...", help="Files to check.")], as_json: Json = False
 ) -> None:
-    """Report all problems of files at once: prescriptions, configurations, sweeps, tables of heights.
+    """Report all problems of files at once: prescriptions, cameras, configurations, sweeps, tables of heights.
 
     What a file is, its ending and its keys tell. Each problem is a line, with the number of the line in the file where
     it is known. Exit status 2 if there is one; notes on how a lens file is read leave it at 0.
@@ -108,7 +108,7 @@ def schema_command(
         choice(
             (
                 *("prescription", "run", "sweep", "images", "visits", "align", "site", "coatings", "tolerances"),
-                *("optimization", "degrees_of_freedom"),
+                *("optimization", "degrees_of_freedom", "camera"),
             ),
             metavar="KIND",
             help="Kind of file.",

@@ -35,6 +35,8 @@ _SMOOTH = 1.5
 _CELLS = 96
 #: Difference of obscurations from which on it is said: 0.5 um of Z11 look like 0.04 in the LSST.
 _DIFFERENCE = 0.05
+#: Part of the obscuration below which what is left of a hole is no measure of it: the seeing fills it.
+_FILLED = 0.5
 #: Flags of donuts whose edges are not those of the pupil.
 _UNFIT = DonutFlag.BLENDED | DonutFlag.CUT_OFF | DonutFlag.OTHER_SIZE
 #: Least width of the lit ring over the FWHM of the blur.
@@ -64,6 +66,8 @@ def warn_of_other_hole(instrument: Instrument, solutions: dict[int, StarSolution
     if not len(donut) or crowded or alike.any() or mixed:
         return
     lit = lit_obscuration(telescope, instrument.middle)
+    if max(donut.max(), model.max()) < _FILLED * lit:
+        return
     shown = np.where(scaled, lit * (1.0 + relative), donut)
     differences = shown - lit
     if (np.abs(differences) > _DIFFERENCE).all() and np.ptp(np.sign(differences)) == 0.0:

@@ -28,6 +28,7 @@ from ..design.analyses.coatings import Coatings, CoatingsFile
 from ..design.optimize.optimize_file import OptimizeFile, load_optimization
 from ..imaging.config import ImagesConfig, load_images_configuration
 from ..models.camera.focal_plane import FocalPlane
+from ..models.io.camera_file import CameraFile, is_camera, read_camera
 from ..models.io.prescription import ENDINGS, load_telescope
 from ..models.io.site_file import SiteFile, load_site
 from ..models.io.yaml.reader import MAX_BYTES, Prescription
@@ -75,8 +76,11 @@ SchemaKind = Literal[
     "tolerances",
     "optimization",
     "degrees_of_freedom",
+    "camera",
 ]
-#: In the order in which they are chosen where a file could be of two kinds.
+#: Chosen by what stands under its keys: runs name CCDs too.
+CAMERA = FileKind("camera", CameraFile, read_camera, PrescriptionError)
+#: In the order in which the others are chosen where a file could be of two kinds.
 KINDS = (
     FileKind("prescription", Prescription, load_telescope, PrescriptionError),
     FileKind("run", Configuration, _load_run),
@@ -89,6 +93,7 @@ KINDS = (
     FileKind("tolerances", ToleranceFile, _load_tolerances),
     FileKind("optimization", OptimizeFile, load_optimization),
     FileKind("degrees_of_freedom", DegreesOfFreedomFile, load_degrees_of_freedom, PrescriptionError),
+    CAMERA,
 )
 
 
@@ -128,8 +133,8 @@ def validate_file(path: str | os.PathLike[str]) -> Validation:
     """Find all problems of a file.
 
     Prescriptions (YAML, Zemax, CODE V), run configurations, sweeps, configurations of images, visits and alignment,
-    sites, coatings, tolerances, optimisations, degrees of freedom, and tables of CCD heights; which of them it is, its
-    ending and its keys tell.
+    sites, coatings, tolerances, optimisations, degrees of freedom, cameras, and tables of CCD heights; which of them it
+    is, its ending and its keys tell.
     Values that contradict one another are reported once everything else is in order.
 
     Parameters
@@ -161,7 +166,7 @@ def file_schema(kind: SchemaKind) -> dict[str, Any]:
     ----------
     kind : str
         "prescription", "run", "sweep", "images", "visits", "align", "site", "coatings", "tolerances",
-        "optimization" or "degrees_of_freedom".
+        "optimization", "degrees_of_freedom" or "camera".
 
     Raises
     ------
@@ -179,14 +184,19 @@ def _yaml_file(path: Path) -> Validation:
         return Validation(str(path), "YAML", (error,))
     if "opticalSystem" in content:
         return _lens_file(path)
-    # Where two kinds have the keys, the one with fewer others.
-    kind = max(KINDS, key=lambda k: (len(set(content) & _keys(k)), -len(_keys(k))))
-    if not set(content) & _keys(kind):
-        raise ConfigError(f"none of the keys of a {', '.join(k.name for k in KINDS)} is in it", file=path)
+    kind = CAMERA if is_camera(content) else _kind_by_keys(content, path)
     problems = _schema_problems(kind, content, path)
     if not problems:
         problems = _loading_problems(kind.load, path)
     return Validation(str(path), kind.name, tuple(_with_line(error, path) for error in problems))
+
+
+def _kind_by_keys(content: dict[str, Any], path: Path) -> FileKind:
+    """Return the kind with most of the keys; where two have as many, the one with fewer others."""
+    kind = max((k for k in KINDS if k is not CAMERA), key=lambda k: (len(set(content) & _keys(k)), -len(_keys(k))))
+    if not set(content) & _keys(kind):
+        raise ConfigError(f"none of the keys of a {', '.join(k.name for k in KINDS)} is in it", file=path)
+    return kind
 
 
 def _keys(kind: FileKind) -> set[str]:

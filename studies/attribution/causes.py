@@ -123,3 +123,9 @@ def checked_causes(config: Configuration, causes: Sequence[str] | None = None) -
         if problem is not None:
             raise ConfigError(f"{name} cannot be switched off: {problem}")
     return tuple(dict.fromkeys(causes))
+
+
+def always_on(config: Configuration) -> dict[str, str]:
+    """Return the causes that a resolved configuration has and cannot be without, each with the reason."""
+    problem = _no_atmosphere(config) if config.atmosphere.enabled else None
+    return {} if problem is None else {"atmosphere": problem}

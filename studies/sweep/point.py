@@ -10,7 +10,8 @@ A parameter is
 A telescope without a camera has metrics of the optics alone: see :mod:`pachon.studies.sweep.telescope_point`.
 
 Random numbers are common to all points of a replica. Heights keep their pattern when a term grows, stars their
-positions, turbulence and wind their course. A difference between two points is then an effect of their parameters.
+positions, turbulence and wind their course. A difference between two points is then an effect of their parameters. With
+screens another Fried parameter, or zenith angle, makes other turbulence: which modes are on which screen follows it.
 """
 
 from __future__ import annotations

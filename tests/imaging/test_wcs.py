@@ -223,3 +223,23 @@ def test_all_ccds_of_the_lsst_are_within_a_milliarcsecond_of_the_tracer(lsst_r):
     for ccd in CAMERA.ccd_names:
         wcs = pachon.wcs(lsst_r, ccd, (RA, DEC), ROLL)
         assert separation(np.deg2rad(wcs.all_pix2world(PIXELS, 0)), traced(lsst_r, ccd)) < 1e-3 * ARCSEC, ccd
+
+
+@pytest.mark.parametrize(("name", "worst"), [("lsst_v3.3_r", 0.09), ("decam", 0.17)])
+def test_coma_moves_centroids_from_the_world_coordinates(name, worst):
+    """The mean ray of the pupil lands beside the chief ray, whose coordinates they are, by as much as the docs say."""
+    telescope = pachon.load_telescope(name)
+    radius = 0.5 * telescope.pupil_diameter * np.sqrt(np.linspace(telescope.pupil_obscuration**2, 1.0, 42)[1:-1])
+    angle = 2.0 * np.pi * np.arange(60) / 60
+    pupil = np.append(0.0, np.outer(radius, np.cos(angle))), np.append(0.0, np.outer(radius, np.sin(angle)))
+    wavelength = telescope.default_wavelength
+
+    def moved(field):
+        rays = pachon.launch_rays(telescope, field=(field, 0.0), wavelength=wavelength, pupil=pupil)
+        landed = pachon.trace(telescope, rays)
+        lit = landed.status[1:] == 0
+        return np.hypot(*(landed.position[1:, :2][lit].mean(axis=0) - landed.position[0, :2]))
+
+    fields = np.linspace(0.0, telescope.field_radius, 15)
+    scale = 1.0 / pachon.first_order(telescope, wavelength).focal_length
+    assert max(moved(field) for field in fields) * scale / ARCSEC == pytest.approx(worst, abs=0.005)

@@ -79,3 +79,15 @@ def test_one_donut_of_a_crowd_does_not_speak_for_all(tmp_path, monkeypatch, coun
         warnings.simplefilter("always", PrescriptionWarning)
         hole.warn_of_other_hole(instrument, dict.fromkeys(range(count)), None)
     assert bool(caught) == said
+
+
+@pytest.mark.parametrize(("donut", "said"), [(0.06, False), (0.6, True)])
+def test_a_hole_that_the_seeing_fills_says_nothing(tmp_path, monkeypatch, donut, said):
+    """A donut of f/6.3, 1.5 mm out of focus, is three times as wide as the seeing: its own image has hardly a hole."""
+    model = np.array([[0.0, 0.0, 0.07, 0.0]])
+    monkeypatch.setattr(hole, "_brightest_ratios", lambda *_: (np.full((1, 4), donut), model))
+    instrument = SimpleNamespace(telescope=telescope(tmp_path, 0.1, 0.4), middle=500e-9)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", PrescriptionWarning)
+        hole.warn_of_other_hole(instrument, {0: None}, None)
+    assert bool(caught) == said

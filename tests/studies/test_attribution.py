@@ -20,7 +20,16 @@ from pachon.pipeline.summary import correlations
 from pachon.reconstruction.ccd_product import CCD_KINDS, KINDS
 from pachon.studies.attribution import attribution
 from pachon.studies.attribution.attribution import attribute, change_errors, without_cause
-from pachon.studies.attribution.causes import CAUSES, FULL, GROUND_LIFT, NOISE, OPTICS, checked_causes, without
+from pachon.studies.attribution.causes import (
+    CAUSES,
+    FULL,
+    GROUND_LIFT,
+    NOISE,
+    OPTICS,
+    always_on,
+    checked_causes,
+    without,
+)
 from pachon.studies.attribution.product import write_attribution
 from pachon.wavefront.atmosphere.turbulence import structure_function
 
@@ -205,7 +214,11 @@ def test_causes_that_are_off_are_no_causes(tiny):
     assert not {"tilt", "diffusion"} & set(checked_causes(config))
     assert "active_optics" in checked_causes(config)
     assert not {"heights", "ccd"} & set(checked_causes(tiny(focal_plane__budget="flat")))
-    assert "atmosphere" not in checked_causes(tiny(psf__engine="long_exposure"))
+    for engine in ("long_exposure", "statistical"):
+        of_engine = tiny(psf__engine=engine, atmosphere__exposure_s=15.0)
+        assert "atmosphere" not in checked_causes(of_engine)
+        assert always_on(of_engine) == {"atmosphere": f"psf.engine = {engine}, which needs it"}
+    assert always_on(config) == always_on(tiny(atmosphere__enabled=False)) == {}
     for options, cause, message in (
         ({"focal_plane__tilt": False}, "tilt", "focal_plane.tilt = false"),
         ({"focal_plane__budget": "flat"}, "heights", "focal_plane.budget = flat"),

@@ -75,6 +75,9 @@ def test_values_that_contradict_one_another(tmp_path):
         ("tolerances: [{name: S1.radius_mm, size: 1}]\nloss: 3\n", "tolerances", ["loss"]),
         ("tolerances: [{name: S1.radius_mm, size: 1}]\ndraws: 20\n", "tolerances", []),
         ("variables: [S1.radius]\nbounds: {S1.radius: 3}\n", "optimization", ["bounds.S1.radius"]),
+        ("name: c\nsource: s\npixel_um: 15\npixels: [2, 2]\nccds: [{name: A, x_mm: 0, y_mm: 0}]\n", "camera", []),
+        ("name: c\nsource: s\npixel_um: -15\nccds: [{name: A, x_mm: 0}]\n", "camera", ["pixel_um", "ccds[A].y_mm"]),
+        ("ccds: [R22]\n", "run", []),
         ("name: 'a", "YAML", [None]),
     ],
 )
@@ -91,6 +94,7 @@ def test_files_of_the_project_have_no_problems():
         "models/data/lsst_degrees_of_freedom.yaml",
         "models/data/paul_baker.yaml",
         "models/data/cerro_pachon.yaml",
+        "models/data/camera_hsc.yaml",
         "studies/sweep/examples/table1_small.yaml",
     ]
     for name in good:

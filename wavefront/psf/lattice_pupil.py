@@ -31,8 +31,10 @@ LATTICE_POINTS = 30000
 RINGS_POINTS = 7500
 #: Fewest points of a lattice.
 FEWEST_POINTS = 500
-#: Most points across the diameter: stars that need more are drawn by dense rays.
+#: Most points across the diameter: stars that need more are drawn by dense rays...
 MOST_ACROSS = 1024
+#: ... or refused, where rays do not suffice: with so many a star takes 20 s and 4 GB at five wavelengths.
+MOST_ACROSS_ALONE = 2048
 # Largest change of the phase of a ray from one point to the next, as the image of its star is wide (rms along an axis):
 # splines then follow the transfer function to 1e-4.
 _PHASE_STEP = 0.8

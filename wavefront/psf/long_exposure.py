@@ -23,7 +23,8 @@ Where anything but discs and rings stops light, much of the pupil is vignetted o
 autocorrelation over a lattice of rays takes the place of spokes and strips (:mod:`.lattice_pupil`), at some thirty
 times the cost.
 
-Stars far from focus (donuts) are drawn by the dense rays of :mod:`.mean_rays`.
+Stars far from focus (donuts) are drawn by the dense rays of :mod:`.mean_rays`, less the same strips. Pupils whose long
+baselines matter have no strips: they keep the lattice, or are refused.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ import numpy as np
 import warp as wp
 
 from ...core.arguments import check_arguments
+from ...core.errors import DomainError
 from ...core.launch import launch
 from ...core.units import require_count
 from ...core.warp_arrays import warp_array
@@ -46,7 +48,14 @@ from ..atmosphere.turbulence import coherence, structure_function
 from ..pupil_optics import PupilOptics
 from .clear_pupil import SpokePupil, clear_edges, has_only_annuli
 from .engine import ExposedStars, PsfEngine, PsfInputs, PsfRenderer, Stars, expose_by_kind, metric_of
-from .lattice_pupil import LATTICE_POINTS, MOST_ACROSS, RINGS_POINTS, LatticeRays, LatticeTransfer
+from .lattice_pupil import (
+    LATTICE_POINTS,
+    MOST_ACROSS,
+    MOST_ACROSS_ALONE,
+    RINGS_POINTS,
+    LatticeRays,
+    LatticeTransfer,
+)
 from .long_exposure_kernels import place_points, sample_pixels, transform_pupils
 from .mean_rays import MeanRaysRenderer, drawing_ray_counts, ray_counts
 from .pupil_rims import strip_overlap
@@ -142,7 +151,8 @@ class LongExposureRenderer(PsfRenderer):
         self._width = 0.5 * self._diameter * (1.0 - self._obscuration)
         rings = has_only_annuli(self._telescope)
         # Whether every star needs the lattice in place of strips along the rims.
-        self._general = not rings or not self._strips_suffice()
+        self._strips = self._strips_suffice()
+        self._general = not rings or not self._strips
         count = options.n_pupil or options.lattice_points
         if rings:
             count = options.lattice_points if self._general else RINGS_POINTS
@@ -285,7 +295,7 @@ class LongExposureRenderer(PsfRenderer):
 
     def _ray_counts(self, optics: PupilOptics) -> np.ndarray:
         """Return the number of rays of each star far from focus, 0 near it, shape [n_star] int."""
-        return ray_counts(optics, self._plane.pixel_size)
+        return ray_counts(optics, self._plane.pixel_size, self.focal_length)
 
     def _expose_rays(self, rays: int, stars: Stars) -> ExposedStars:
         """Expose stars far from focus by a number of rays."""
@@ -296,12 +306,14 @@ class LongExposureRenderer(PsfRenderer):
         return spectrum
 
     def _expose_lattice(self, stars: Stars) -> ExposedStars:
-        """Expose stars by lattices as fine as each needs, or by rays where that is too fine."""
+        """Expose stars by lattices as fine as each needs, or by rays where that is too fine and strips suffice."""
         rays = self._lattice_rays(self._lattice, stars)
         refinement = self._lattice.refinement(rays)
         if (refinement == 1).all():
             return self._expose_autocorrelation([(self._lattice, rays, stars)])
-        finest = MOST_ACROSS // self._lattice.lattice.size
+        finest = (MOST_ACROSS if self._strips else MOST_ACROSS_ALONE) // self._lattice.lattice.size
+        if not self._strips:
+            self._check_refinement(refinement, finest, stars)
         kinds = np.where(refinement > finest, -drawing_ray_counts(rays.optics, self._plane.pixel_size), refinement)
 
         def expose(kind: int, stars: Stars) -> ExposedStars:
@@ -315,6 +327,17 @@ class LongExposureRenderer(PsfRenderer):
             )
 
         return expose_by_kind(kinds, expose, stars)
+
+    def _check_refinement(self, refinement: np.ndarray, finest: int, stars: Stars) -> None:
+        """Raise a DomainError for a star whose lattice would be finer than the finest one."""
+        star = int(np.argmax(refinement))
+        if refinement[star] > finest:
+            x, y = np.rad2deg(stars.fields[star])
+            raise DomainError(
+                f"engine = {self._options.name!r}: the star at field ({x:.4g}, {y:.4g}) deg is too far from focus for a"
+                f" pupil of {self._diameter:g} m, by {refinement[star] / finest:.2g} times; expected a telescope nearer"
+                " to focus ('wave' draws others)"
+            )
 
     def _lattice_rays(self, lattice: LatticeTransfer, stars: Stars) -> LatticeRays:
         return lattice.trace(lambda wavelengths, points: self._trace(stars.fields, points, self._threads, wavelengths))

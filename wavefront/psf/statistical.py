@@ -40,15 +40,13 @@ from .field_optics import FieldOptics, field_optics
 from .image_plane import square_transfer
 from .lattice_pupil import RINGS_POINTS
 from .long_exposure import LongExposureEngine, LongExposureRenderer
+from .mean_rays import FAR_ANGLE
 from .sample_packets import samples
 from .spectral_rule import spectral_rule
 from .statistical_kernels import blur_spectra
 
 #: FWHM of the weight under which moments of the fourth order have the same effect as the kernel [rad].
 MATCHED_FWHM = 0.7 * ARCSEC
-#: Rms radius of the blur by the optics from which a star counts as far from focus [rad]: that of :data:`.mean_rays.FAR`
-#: on the LSST.
-FAR_ANGLE = 1.0 * ARCSEC
 # Wavenumbers of the response, and the largest in units of one over the weight's rms width.
 _WAVENUMBERS = 512
 _HIGHEST = 6.0
