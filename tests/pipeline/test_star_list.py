@@ -322,7 +322,7 @@ def test_without_a_catalogue_and_a_pointing_the_hash_stays(tiny):
 
 def test_a_run_without_enough_stars_ends_before_it_begins(tmp_path, config):
     experiment = Experiment.from_config(with_options(config, ccds=("R41_S20",)))
-    reason = r"CCD R41_S20: 3 stars of stars\.csv lie on it: expected at least 5"
+    reason = r"CCD R41_S20: 3 stars of stars\.csv on it: expected at least 5"
     with pytest.raises(PachonError, match=reason):
         run(experiment, tmp_path / "few")
     assert not (tmp_path / "few").exists()
@@ -348,7 +348,7 @@ def test_the_stars_of_the_catalogue_are_observed(tmp_path, config, sky, magnitud
         (tmp_path / name).mkdir()
         with experiment.screens():
             simulated = simulate_ccds(experiment, partial(write_ccds, experiment, tmp_path / name), strict=False)
-    assert simulated.not_modelled == {"R41_S20": "3 stars of stars.csv lie on it: expected at least 5"}
+    assert simulated.not_modelled == {"R41_S20": "3 stars of stars.csv on it: expected at least 5"}
     path = tmp_path / "a" / "ccd_R22_S11.fits"
     assert path.read_bytes() == (tmp_path / "b" / "ccd_R22_S11.fits").read_bytes()
     table = fits.getdata(path, "STARS")

@@ -26,7 +26,7 @@ from .channels import Channels
 from .engine import PsfInputs
 
 #: Largest error of the transfer function: e of the LSST is then wrong by 5e-5 (rms), its size by 1e-4; with two
-#: wavelengths and no dispersion e by 6e-6.
+#: wavelengths and no dispersion e by 1e-6.
 LARGEST_ERROR = 3e-4
 # Wavelengths that are tried, beside the middle one, to which fields and chief rays belong: it is dark where there are
 # two.

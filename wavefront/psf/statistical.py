@@ -31,7 +31,7 @@ from ...models.zernike_polynomials import annular_zernike_gradients
 from ..aberration import ResidualWavefront
 from ..atmosphere.exposure_fields import NOLL, ExposureFields, draw_exposure
 from ..atmosphere.moment_covariance import LEAST_EXPOSURE, ExposedAir, MomentResponse
-from ..atmosphere.turbulence import diffraction_otf
+from ..atmosphere.turbulence import coherence, diffraction_otf, structure_function
 from ..pupil_optics import PupilOptics, trace_pupils
 from .clear_pupil import SpokePupil
 from .engine import ExposedStars, PsfInputs, Stars
@@ -124,10 +124,12 @@ class StatisticalRenderer(LongExposureRenderer):
         telescope = inputs.telescope
         self._base = inputs.aberration
         self._exposed_air = ExposedAir.of(air, telescope.pupil_diameter, telescope.pupil_obscuration)
+        # Whichever wavelengths stand for those of the light, the exposure drawn is one.
+        self._light = inputs.wavelengths
         self._rule = None if inputs.has_spectra else spectral_rule(inputs, self.depths)
         super().__init__(inputs if self._rule is None else self._rule.inputs(inputs), options)
         with_air = _WithAir.of(self._base, self._exposed_air, self.drawn)
-        self._inputs, self._wave_count = replace(self._inputs, aberration=with_air), len(inputs.wavelengths)
+        self._inputs = replace(self._inputs, aberration=with_air)
 
     @cached_property
     def drawn(self) -> ExposureFields:
@@ -142,14 +144,15 @@ class StatisticalRenderer(LongExposureRenderer):
         """Return the response of ellipticity and size of the mean image of ideal optics."""
         weight = MATCHED_FWHM / math.sqrt(8.0 * math.log(2.0))
         k = np.linspace(0.0, _HIGHEST / weight, _WAVENUMBERS)
-        baseline = self._wavelengths[:, None] * k / (2.0 * math.pi)
+        air, wavelengths = self._inputs.atmosphere, self._light[:, None]
+        assert air is not None
+        baseline = wavelengths * k / (2.0 * math.pi)
         diffraction = diffraction_otf(baseline, self._diameter, self._obscuration)
-        air = np.stack([self._turbulence(b)[w] for w, b in enumerate(baseline)])
+        turbulence = coherence(structure_function(baseline, air.r0, air.outer_scale), wavelengths)
         on_detector = k / self.focal_length
         pixel = square_transfer(on_detector, 0.0 * k, self._plane.pixel_size)
         spread = np.exp(-0.5 * (self._plane.diffusion**2 + self._plane.jitter**2) * on_detector**2)
-        photons = None if self._rule is None else self._rule.photons
-        mean = np.average(air * diffraction, axis=0, weights=photons)
+        mean = (turbulence * diffraction).mean(axis=0)
         return MomentResponse.of(k, mean * pixel * spread, weight)
 
     def kernels(self, optics: PupilOptics) -> np.ndarray:
@@ -172,7 +175,7 @@ class StatisticalRenderer(LongExposureRenderer):
         photons = np.broadcast_to(self._rule.photons, (len(stars), len(self._rule.photons)))
         exposed = super()._expose(replace(stars, photons=photons))
         # Apertures cut all wavelengths alike.
-        lit = np.repeat(exposed.lit_fraction[:, :1], self._wave_count, axis=1)
+        lit = np.repeat(exposed.lit_fraction[:, :1], len(self._light), axis=1)
         return exposed._replace(lit_fraction=lit)
 
     def _exposed_spectra(self, spectrum: np.ndarray, optics: PupilOptics) -> np.ndarray:
