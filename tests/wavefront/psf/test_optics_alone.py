@@ -29,14 +29,15 @@ def ellipticity(lsst_r):
 
 @pytest.fixture(scope="module")
 def borders():
-    """Points 1.5 mm apart on either side of 24 borders between CCDs, and as far apart within one of the two."""
+    """Points 2.6 mm apart on either side of 24 borders between CCDs, and as far apart within one of the two."""
     centers = pachon.lsst_camera().centers
     radius = np.hypot(*centers.T)
-    chosen = np.flatnonzero((radius > 0.10) & (radius < 0.24) & np.isin(np.arange(189) % 3, (0, 1)))
+    # The right-hand neighbour in the raft stands one CCD pitch away: 42.25 mm for CCDs of at least 40 mm.
+    to_right = np.hypot(*(centers - centers[:, None] - [0.04225, 0.0]).transpose(2, 0, 1))
+    chosen = np.flatnonzero((radius > 0.10) & (radius < 0.24) & (to_right.min(axis=1) < 1e-4))
     left = centers[np.random.default_rng(4).choice(chosen, 24, replace=False)]
-    # The right-hand neighbour in the raft stands one CCD pitch away: 42.25 mm for a CCD of 40.96 mm.
     along = np.array([1.0, 0.0])
-    return tuple(left + (0.5 * 0.04225 + step) * along for step in (-0.75e-3, 0.75e-3, -2.25e-3))
+    return tuple(left + (0.5 * 0.04225 + step) * along for step in (-1.3e-3, 1.3e-3, -3.9e-3))
 
 
 def rms(values):
