@@ -64,8 +64,9 @@ def atmosphere(seed, options):
 
 def expose(options, telescope, fields, air, engine):
     """Return the PSFs of an exposure."""
-    stamps = pachon.Stamps.of_camera("decam" if options.telescope == "decam" else "lsst")
+    stamps = pachon.Stamps.of_camera("lsst")
     if options.telescope == "decam":
+        stamps = pachon.Stamps.of_camera("decam")
         # Under a weight of 0.5 arcsec sums over its own pixels of 0.26 depend on the place within them, by 4e-3 in e1.
         stamps = replace(stamps, size=61, pixel_size=0.5 * stamps.pixel_size)
     aberration = pachon.wavefront.ResidualWavefront.draw(telescope, RMS, 1, 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.errors import PachonError, ProductError
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from ..sensing.model import DonutModel
     from ..sensing.orientation import OrientationCheck
     from ..sensing.result import DonutFit
+    from ..sensing.stamp_headers import HeaderValues
     from ..sensing.wavefront_fits import WavefrontFit
     from .donut_options import FitOptions, FrameOptions, StampOptions, TelescopeOptions
 
@@ -78,7 +80,7 @@ class DonutWork:
         files = StampFiles.read(telescope.files, stamps.positions, stamps.stamp, stamps.mask, stamps.variance)
         header = files.header()
         frames = frame_options.frames(header)
-        believed = frames.telescope(_focused(telescope, files))
+        believed = frames.telescope(_focused(telescope, header, files.paths[0]))
         inputs = donut_inputs(files, frame_options, frames, believed, stamps.electrons(header), telescope.field())
         model = DonutModel(
             air=fit.air(believed, telescope.outer_scale_m),
@@ -101,7 +103,7 @@ class DonutWork:
             _sky_variances(inputs, fit.sky_variance),
             frame_options.field_projection,
             fit.threads,
-            _header_remark(files, believed, light),
+            _header_remark(files.paths[0], header.text, believed, light),
         )
 
     @property
@@ -166,18 +168,17 @@ def oriented(fit: DonutFit) -> np.ndarray:
     return fit.usable | (fit.flags & int(DonutFlag.DEFOCUS_SIGN) > 0)
 
 
-def _focused(options: TelescopeOptions, files: StampFiles) -> Telescope:
-    """Return the telescope in focus: of the option, or of the header."""
+def _focused(options: TelescopeOptions, header: HeaderValues, file: Path) -> Telescope:
+    """Return the telescope in focus: of the option, or of the header of a file."""
     from ..sensing.stamp_headers import TELESCOPE_KEY
 
-    header = files.header()
     try:
         return options.load(header.model or DEFAULT_TELESCOPE)[1]
     except PachonError as error:
         if options.telescope is not None or header.telescope is None:
             raise
         text = f"{TELESCOPE_KEY} = {header.telescope!r}: {error}; give the telescope by --telescope"
-        raise ProductError(text, file=files.paths[0], key=TELESCOPE_KEY) from None
+        raise ProductError(text, file=file, key=TELESCOPE_KEY) from None
 
 
 def _unknowns(options: FitOptions, count: int) -> WavefrontFit:
@@ -214,10 +215,9 @@ def _sky_variances(inputs: DonutInputs, sky_variance: float | None) -> list[floa
     return planes if len(planes) == len(inputs.images) else None
 
 
-def _header_remark(files: StampFiles, telescope: Telescope, light: np.ndarray | None) -> str:
-    """Return what was taken from the headers, in a sentence; empty where nothing was."""
+def _header_remark(file: Path, text: str, telescope: Telescope, light: np.ndarray | None) -> str:
+    """Return what was taken from the header of a file, in a sentence; empty where nothing was."""
     from ..wavefront.request import wavelength_points
 
-    text = files.header().text
     lengths = ", ".join(f"{1e9 * wavelength:.4g}" for wavelength in wavelength_points(telescope, light))
-    return f"{files.paths[0]}: {text} of its header; {telescope.name} at {lengths} nm" if text else ""
+    return f"{file}: {text} of its header; {telescope.name} at {lengths} nm" if text else ""

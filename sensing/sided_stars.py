@@ -45,6 +45,7 @@ def sided_stars(
         Noll indices of the terms over the field that a telescope's wavefront has.
     """
     number = star_numbers(fields, SAME_STAR) if numbers is None else numbers
+    air = exposure_air(instrument)
 
     def smoothness(index: np.ndarray, fits: Sequence[SideFit]) -> float:
         star = number[index]
@@ -55,7 +56,7 @@ def sided_stars(
             np.zeros(len(star), dtype=np.int64),
         )
         basis = field_basis(instrument, fields[index], field_noll)
-        return fit_hierarchy(observations, basis, exposure_air(instrument)).loss
+        return fit_hierarchy(observations, basis, air).loss
 
     decision = decide_sides([star.sides for star in stars], smoothness)
     changed = []

@@ -41,7 +41,7 @@ import warp as wp
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.launch import launch
-from ...core.units import require_count
+from ...core.units import field_label, require_count
 from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
 from ..atmosphere.turbulence import coherence, structure_function
@@ -173,11 +173,16 @@ class LongExposureRenderer(PsfRenderer):
         plane = self._plane
         return max(GRID_MARGIN * (plane.size - plane.room), plane.size) * plane.pixel_size
 
-    def _turbulence(self, baseline: np.ndarray) -> np.ndarray:
-        """Return the mean transfer function of the atmosphere at baselines [m], shape [n_wave, n]."""
+    def _turbulence(self, baseline: np.ndarray, wavelengths: np.ndarray | None = None) -> np.ndarray:
+        """Return the mean transfer function of the atmosphere at baselines [m] of all wavelengths, or of each.
+
+        Baselines have the shape [n] or [n_wave, n], the result has [n_wave, n]; wavelengths [m] are those of the
+        renderer by default.
+        """
         air = self._atmosphere
         assert air is not None, "the engine needs one"
-        return coherence(structure_function(baseline, air.r0, air.outer_scale), self._wavelengths[:, None])
+        waves = self._wavelengths if wavelengths is None else wavelengths
+        return coherence(structure_function(baseline, air.r0, air.outer_scale), waves[:, None])
 
     def _transfer_bounds(self, longest: float) -> np.ndarray:
         """Return the largest transfer of atmosphere and detector at each frequency up to a baseline [m], [n_wave, n].
@@ -189,7 +194,7 @@ class LongExposureRenderer(PsfRenderer):
         k = 2.0 * math.pi / self.period * count
         diagonal = math.sqrt(0.5) * k
         detector = [self._plane.transfer(*along) for along in ((k, 0 * k), (0 * k, k), (diagonal, diagonal))]
-        air = np.array([self._turbulence(s * count)[w] for w, s in enumerate(step)])
+        air = self._turbulence(step[:, None] * count)
         transfer = air * np.max(np.abs(detector), axis=0)
         return np.asarray(transfer * self._channels.of_wavelength(self._channels.spread(k)))
 
@@ -332,11 +337,10 @@ class LongExposureRenderer(PsfRenderer):
         """Raise a DomainError for a star whose lattice would be finer than the finest one."""
         star = int(np.argmax(refinement))
         if refinement[star] > finest:
-            x, y = np.rad2deg(stars.fields[star])
             raise DomainError(
-                f"engine = {self._options.name!r}: the star at field ({x:.4g}, {y:.4g}) deg is too far from focus for a"
-                f" pupil of {self._diameter:g} m, by {refinement[star] / finest:.2g} times; expected a telescope nearer"
-                " to focus ('wave' draws others)"
+                f"{field_label(stars.fields[star])}: the star is too far from focus for a pupil of"
+                f" {self._diameter:g} m, by {refinement[star] / finest:.2g} times; expected a telescope nearer to focus"
+                f" with engine = {self._options.name!r} ('wave' draws others)"
             )
 
     def _lattice_rays(self, lattice: LatticeTransfer, stars: Stars) -> LatticeRays:

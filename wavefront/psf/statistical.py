@@ -31,7 +31,7 @@ from ...models.zernike_polynomials import annular_zernike_gradients
 from ..aberration import ResidualWavefront
 from ..atmosphere.exposure_fields import NOLL, ExposureFields, draw_exposure
 from ..atmosphere.moment_covariance import LEAST_EXPOSURE, ExposedAir, MomentResponse
-from ..atmosphere.turbulence import coherence, diffraction_otf, structure_function
+from ..atmosphere.turbulence import diffraction_otf
 from ..pupil_optics import PupilOptics, trace_pupils
 from .clear_pupil import SpokePupil
 from .engine import ExposedStars, PsfInputs, Stars
@@ -144,15 +144,12 @@ class StatisticalRenderer(LongExposureRenderer):
         """Return the response of ellipticity and size of the mean image of ideal optics."""
         weight = MATCHED_FWHM / math.sqrt(8.0 * math.log(2.0))
         k = np.linspace(0.0, _HIGHEST / weight, _WAVENUMBERS)
-        air, wavelengths = self._inputs.atmosphere, self._light[:, None]
-        assert air is not None
-        baseline = wavelengths * k / (2.0 * math.pi)
+        baseline = self._light[:, None] * k / (2.0 * math.pi)
         diffraction = diffraction_otf(baseline, self._diameter, self._obscuration)
-        turbulence = coherence(structure_function(baseline, air.r0, air.outer_scale), wavelengths)
         on_detector = k / self.focal_length
         pixel = square_transfer(on_detector, 0.0 * k, self._plane.pixel_size)
         spread = np.exp(-0.5 * (self._plane.diffusion**2 + self._plane.jitter**2) * on_detector**2)
-        mean = (turbulence * diffraction).mean(axis=0)
+        mean = (self._turbulence(baseline, self._light) * diffraction).mean(axis=0)
         return MomentResponse.of(k, mean * pixel * spread, weight)
 
     def kernels(self, optics: PupilOptics) -> np.ndarray:
