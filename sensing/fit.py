@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -20,6 +20,7 @@ from ..raytrace.rays import Projection
 from ..wavefront.psf.light import Light
 from .amplifier_steps import AmplifierStep, step_table
 from .bad_pixels import grown
+from .diffraction_vote import DiffractionVote, vote_on_diffraction
 from .fit_star import StarFit, fit_star
 from .flags import DonutFlag
 from .freedom_fit import TelescopeFreedoms
@@ -43,7 +44,6 @@ from .likelihood import pulls
 from .model import DonutModel
 from .noise import PixelNoise, faint_level, measured_noise, smoothed
 from .result import DonutFit
-from .rim_amplitude import VOTERS, RimAmplitude, rim_amplitude, waves_fit_better
 from .rim_table import moved_rims, rim_table
 from .shared_rims import contradicted
 from .stamps import Pixels, central_slices
@@ -66,7 +66,7 @@ _BY_CHANCE = 5.0
 #: Ratio of the noise that a fit leaves to that which it assumed, up to which its search holds.
 _NOISE_AGREES = 2.0
 #: Most fits of a star whose noise is measured.
-_NOISE_FITS = 2
+_NOISE_FITS = 3
 #: Most fits of a star with steps between amplifiers, and change of their amplitudes over their standard deviations
 #: below which these hold.
 _STEP_FITS = 4
@@ -205,23 +205,18 @@ def fit_donuts(
             return _Fitted(stars, solutions, fit.solved(usable, pool))
 
         def first(i: int) -> StarFit:
-            ready = by_rays.get(i)
-            if ready is None:
-                return alone(instrument, i)
-            waves = bool(instrument.model.diffraction)
-            ends = not (waves or ready.preliminary)
-            return ready if ends else alone(instrument, i, replace(ready.with_light(instrument), searched=not waves))
+            begun = vote.begun.get(i)
+            if i in vote.fitted or begun is None:
+                return vote.fitted.get(i) or alone(instrument, i)
+            return alone(instrument, i, replace(begun.with_light(instrument), searched=not vote.diffraction))
 
         def once_more(refined: Instrument) -> _Fitted:
             return fitted_stars(refined, lambda i: alone(refined, i, replace(fitted.stars[i], searched=True)))
 
-        by_rays: dict[int, StarFit] = {}
+        vote = DiffractionVote(bool(model.diffraction))
         if model.diffraction is None:
-            by_rays, diffraction = _by_rays(
-                instrument, partial(alone, instrument, preliminary=True), len(observed), pool
-            )
-            model = replace(model, diffraction=diffraction)
-            instrument = replace(instrument, model=model)
+            vote = vote_on_diffraction(instrument, alone, len(observed), pool)
+            instrument = replace(instrument, model=replace(model, diffraction=vote.diffraction))
         fitted = fitted_stars(instrument, first, progress)
         refined = fit.refined(instrument, list(fitted.solutions.values()), fitted.results)
         if refined is not None:
@@ -257,23 +252,6 @@ def _wavefront_fit(
         if value is not None:
             raise ConfigError(f"{name} and fit are both given: expected it in fit={type(fit).__name__}(...)", key=name)
     return fit
-
-
-def _by_rays(
-    instrument: Instrument, fitted: Callable[[int], StarFit], count: int, pool: Executor
-) -> tuple[dict[int, StarFit], bool]:
-    """Return fits by rays of the first stars by their index, and whether diffraction lowers their chi-square."""
-    stars: dict[int, StarFit] = {}
-    amplitudes: list[RimAmplitude] = []
-    for first in range(0, count, VOTERS):
-        indices = range(first, min(first + VOTERS, count))
-        stars.update(zip(indices, pool.map(fitted, indices), strict=True))
-        usable = [stars[i].usable for i in indices]
-        votes = [rim_amplitude(instrument, star) for star in usable if star is not None]
-        amplitudes += [vote for vote in votes if vote is not None]
-        if len(amplitudes) >= VOTERS:
-            break
-    return stars, waves_fit_better(amplitudes)
 
 
 def _fit_alone(
@@ -361,16 +339,22 @@ def _fit_with_noise(
     if begun is None or begun.usable is None:
         noise = measured_noise(image, smooth - level, used, level)
     else:
-        noise = PixelNoise(float(begun.usable.full.variance.mean()) * begun.unit**2, begun.unit)
+        noise = _noise_of(begun.usable, begun.unit)
     for _ in range(_NOISE_FITS):
         unit = noise.photon
         pixels = Pixels(image / unit, np.full(image.shape, noise.sky / unit**2), used)
         fitted = fit(pixels, sky_level=level / unit, begun=begun)
         if 1.0 / _NOISE_AGREES < fitted.unit < _NOISE_AGREES:
             break
-        noise = replace(noise, sky=noise.sky * fitted.unit, photon=unit * fitted.unit)
+        if fitted.usable is not None:
+            noise = _noise_of(fitted.usable, unit * fitted.unit)
         begun = None
     return replace(fitted, unit=unit * fitted.unit, level=level)
+
+
+def _noise_of(solution: StarSolution, unit: float) -> PixelNoise:
+    """Return the noise that a solution in a unit left [units of the image]."""
+    return PixelNoise(float(solution.full.variance.mean()) * unit**2, unit)
 
 
 def _steps_of(fitted: StarFit | None) -> tuple[AmplifierStep, ...]:

@@ -55,6 +55,9 @@ _SIZES = (0.92, 1.08)
 #: Largest part of the light that rims which have run away make less than none: a star in focus, for which the fit moved
 #: the rim of M2 by 3 m, has 0.07.
 _NEGATIVE = 0.03
+#: Wavefront that telescopes have, Z4 on, root of the summed squares [m]: of two that explain an image alike the smaller
+#: one is the likelier one.
+_LIKELY = 0.3e-6
 
 
 @dataclass(frozen=True)
@@ -287,6 +290,8 @@ class _Search:
 def _search(fitter: StarFitter, start: Start) -> _Search:
     """Return the best coarse solution, with neighbours, and without lines of pixels far off a first one."""
     best = fitter.solve(start.stamp, start.unknowns, tolerance=COARSE if fitter.donut else FINE)
+    if fitter.may_have_other_seeing(best):
+        best = _simplest(fitter, start, best)
     search = _Search(fitter, start, best, best)
     if not fitter.donut:
         return search
@@ -300,6 +305,17 @@ def _search(fitter: StarFitter, start: Start) -> _Search:
     if fitter.instrument.model.neighbours:
         search = replace(search, best=_with_neighbours(search.fitter, search.start, search.best))
     return search
+
+
+def _simplest(fitter: StarFitter, start: Start, best: Solution) -> Solution:
+    """Return the better of a solution and one that begins from the seeing of a star without aberrations.
+
+    Small images have several wavefronts that explain them, in other seeings.
+    """
+    tolerance = COARSE if fitter.donut else FINE
+    plain = fitter.without_wavefront().solve(start.stamp, start.unknowns, tolerance=tolerance)
+    other = fitter.solve(start.stamp, plain.stars[0], tolerance=tolerance)
+    return min(best, other, key=lambda fit: fit.loss + float(fit.shared @ fit.shared) / _LIKELY**2)
 
 
 def _search_of_rims(begun: StarFitter, search: _Search) -> _Search:

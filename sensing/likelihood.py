@@ -205,7 +205,7 @@ def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Lineariz
     if derivatives is None:
         return None
     model, columns, scales = derivatives
-    variance = _variance(stamp, model)
+    variance = pixel_variance(stamp, model)
     residual = (stamp.image - model)[stamp.used]
     scaled = _over_noise(columns, variance, stamp.used)
     brightness = unknowns[FLUX] * columns[..., FLUX].astype(np.float64)
@@ -266,7 +266,7 @@ def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> No
         n = len(unknowns) + len(wave)
         return NormalEquations(np.zeros((n, n)), np.zeros(n), np.inf, np.inf)
     model, columns, scales = derivatives
-    variance, last = _variance(stamp, model), stamp.grid.last
+    variance, last = pixel_variance(stamp, model), stamp.grid.last
     assert isinstance(last, _Derivatives)
     pixels = columns.reshape(-1, columns.shape[-1])
     if last.curvature is None or last.curvature[0] is not stamp:
@@ -299,10 +299,11 @@ def _landed(stamp: Stamp, wave: np.ndarray, landing: np.ndarray, response: np.nd
 
 def pulls(stamp: Stamp, model: np.ndarray) -> np.ndarray:
     """Return residuals over their standard deviations, shape [ny, nx]."""
-    return np.asarray((stamp.image - model) / np.sqrt(_variance(stamp, model)))
+    return np.asarray((stamp.image - model) / np.sqrt(pixel_variance(stamp, model)))
 
 
-def _variance(stamp: Stamp, model: np.ndarray) -> np.ndarray:
+def pixel_variance(stamp: Stamp, model: np.ndarray) -> np.ndarray:
+    """Return the variance of the pixels of a model [electron^2], shape [ny, nx]."""
     return np.maximum(model + stamp.variance, np.maximum(_LEAST_VARIANCE, 0.1 * stamp.variance))
 
 

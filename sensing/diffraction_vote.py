@@ -1,0 +1,167 @@
+r"""Whether images of donuts have light that is diffracted at the rims of the pupil, from the images themselves.
+
+A fit of rays tells how much chi-square would fall by an amount a of the diffracted light, 0 for rays and 1 for waves:
+with its image r, the derivatives A of all else, their prior P, the residuals d and the variance V, the best amount is
+:math:`\hat a = \tilde r^T V^{-1} d / \tilde r^T V^{-1} r` with :math:`\tilde r` the part of r that A does not explain.
+Chi-square with a = 1 is lower than with a = 0 where :math:`\hat a > 1/2`.
+
+Where an amount is far from one and from zero, by its error, the fit of rays is no start: donuts of a 1.2 m telescope of
+f/2.5 have their seeing 1.2 arcsec too wide by it, for want of diffracted light. Neither is it where images are small.
+Then the fits of both kinds are compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from functools import partial
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from ..wavefront.psf.pupil_rims import pupil_rims
+from .fit_star import StarFit
+from .image_model import STRENGTH, LandedLight
+from .light import Instrument, diffracting_pieces
+from .likelihood import linearized, pixel_variance
+from .sides import CONTRADICTED
+from .stamps import central_slices
+from .star_fitter import SMALLEST_DONUT, StarSolution
+
+#: Donuts that are asked.
+_VOTERS = 3
+#: Squared amount of diffracted light over its variance, in the mean over donuts, up to which there is none.
+_NONE = 2.0
+
+
+@dataclass(frozen=True)
+class _RimAmplitude:
+    """Amount of diffracted light in an image, 1 for waves and 0 for rays, and the inverse of its variance."""
+
+    value: float
+    precision: float
+
+
+def _rim_amplitude(instrument: Instrument, star: StarSolution) -> _RimAmplitude | None:
+    """Return how much diffracted light an image has; None for stars in focus and images without air.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        Telescope and model of the images, of rays.
+    star : StarSolution
+        Best model by rays.
+    """
+    stamp, solution, light = star.stamp, star.solution, star.light
+    unknowns, wave = solution.stars[0], solution.waves[0]
+    if not _has_air(star) or light.diameter < SMALLEST_DONUT * instrument.pixel:
+        return None
+    pieces = diffracting_pieces(light.diameter / stamp.grid.pixel)
+    rims = pupil_rims(light.telescope, light.direction, instrument.middle, pieces)
+    point = linearized(stamp, unknowns, wave)
+    if point is None:
+        return None
+    landing = stamp.rays.landing(wave)
+    at_rims = stamp.rays.at_rims(rims, landing, None)
+    waves = LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing), at_rims)
+    diffracted = stamp.grid.diffracting(rims).image(unknowns, waves) - point.model
+    columns, scales = point.columns, point.scales.copy()
+    if instrument.known_seeing:
+        scales[STRENGTH] = 0.0
+    light_column, residual = point.over_noise(diffracted[..., None].astype(np.float32))[:, 0], point.pulls
+    prior = np.zeros(len(scales))
+    precision = np.concatenate([instrument.terms.precision, light.shift_precision])
+    prior[len(unknowns) :] = precision
+    state = np.concatenate([np.zeros(len(unknowns)), wave])
+    curvature = columns.T @ columns * np.outer(scales, scales) + np.diag(prior)
+    scale = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
+    cross = scales * (columns.T @ light_column) / scale
+    gradient = (scales * (columns.T @ residual) - prior * state) / scale
+    solved = np.linalg.pinv(curvature / np.outer(scale, scale), rcond=1e-12, hermitian=True) @ np.stack(
+        [cross, gradient], axis=1
+    )
+    information = float(light_column @ light_column - cross @ solved[:, 0])
+    if not information > 0.0:
+        return None
+    return _RimAmplitude(float(light_column @ residual - cross @ solved[:, 1]) / information, information)
+
+
+def _has_air(star: StarSolution) -> bool:
+    """Return whether an image has air: diffraction alone is none of a model of donuts."""
+    return bool(star.solution.stars[0][STRENGTH] > 0.0)
+
+
+def _waves_fit_better(amplitudes: Sequence[_RimAmplitude]) -> bool | None:
+    """Return whether donuts together have less chi-square with diffraction than without; None where they do not say."""
+    if sum((2.0 * a.value - 1.0) * a.precision for a in amplitudes) > 0.0:
+        return True
+    excess = sum(a.value**2 * a.precision for a in amplitudes)
+    return False if amplitudes and excess < _NONE * len(amplitudes) else None
+
+
+def _chi2_fall(rays: StarFit, waves: StarFit) -> float:
+    """Return by how much chi-square is lower by a fit with diffraction than by one of rays, with the noise of this.
+
+    A fit that failed is as much worse as contradicts it; two have no difference.
+    """
+    if rays.usable is None or waves.usable is None:
+        return CONTRADICTED * ((waves.usable is not None) - (rays.usable is not None))
+    by_rays, by_waves = rays.usable, waves.usable
+    shape = (min(rows) for rows in zip(by_rays.model.shape, by_waves.model.shape, strict=True))
+    stamp, middle = by_rays.full, central_slices(by_rays.model.shape, inner := tuple(shape))
+    other = central_slices(by_waves.model.shape, inner)
+    # In the unit of the rays' fit.
+    model = (by_waves.model[other] * waves.unit + waves.level - rays.level) / rays.unit
+    residuals = (stamp.image[middle] - values for values in (by_rays.model[middle], model))
+    before, after = (residual**2 / pixel_variance(stamp, by_rays.model)[middle] for residual in residuals)
+    return float((before - after)[stamp.used[middle] & by_waves.full.used[other]].sum())
+
+
+class DiffractionVote(NamedTuple):
+    """Whether light is diffracted, by the first stars: fits of these, or fits by rays that theirs begin from."""
+
+    diffraction: bool
+    fitted: Mapping[int, StarFit] = MappingProxyType({})
+    begun: Mapping[int, StarFit] = MappingProxyType({})
+
+
+def vote_on_diffraction(
+    instrument: Instrument, alone: Callable[..., StarFit], count: int, pool: Executor
+) -> DiffractionVote:
+    """Return whether diffraction lowers chi-square of the first stars.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        Telescope and model of the images, of rays.
+    alone : callable
+        Fit of one star by itself, for an instrument, its number and ``preliminary``.
+    count : int
+        Number of stars.
+    pool : Executor
+        Where they are fitted.
+    """
+    by_rays: dict[int, StarFit] = {}
+    amplitudes: list[_RimAmplitude] = []
+    for first in range(0, count, _VOTERS):
+        indices = range(first, min(first + _VOTERS, count))
+        by_rays.update(zip(indices, pool.map(partial(alone, instrument, preliminary=True), indices), strict=True))
+        usable = [by_rays[i].usable for i in indices]
+        votes = [_rim_amplitude(instrument, star) for star in usable if star is not None]
+        amplitudes += [vote for vote in votes if vote is not None]
+        if len(amplitudes) >= _VOTERS:
+            break
+    diffraction = _waves_fit_better(amplitudes)
+    if diffraction is None:
+        waves = replace(instrument, model=replace(instrument.model, diffraction=True))
+        voters = [i for i, star in by_rays.items() if star.usable is None or _has_air(star.usable)][:_VOTERS]
+        by_waves = dict(zip(voters, pool.map(partial(alone, waves), voters), strict=True))
+        diffraction = sum(_chi2_fall(by_rays[i], star) for i, star in by_waves.items()) > 0.0
+        if diffraction:
+            return DiffractionVote(diffraction, by_waves)
+    if diffraction:
+        return DiffractionVote(diffraction, begun=by_rays)
+    begun = {i: star for i, star in by_rays.items() if star.preliminary}
+    return DiffractionVote(diffraction, {i: star for i, star in by_rays.items() if i not in begun}, begun)
