@@ -18,10 +18,11 @@ from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ..models.parameters.tolerances import Tolerance
 from ..models.telescope import Telescope
 from ..wavefront.atmosphere.atmosphere import Atmosphere
+from .contradicting_donuts import Consistent, fit_consistently, without
 from .degrees import FreedomEstimate, prior_spreads
 from .exposure import ExposureWavefront
 from .fit_star import StarFit
-from .hierarchy import Basis, ExposureAir, Hierarchy, Observations, fit_hierarchy, star_numbers
+from .hierarchy import Basis, ExposureAir, Observations, fit_hierarchy, star_numbers
 from .image_model import STRENGTH
 from .inputs import noll_indices, small_length
 from .light import Instrument
@@ -153,15 +154,18 @@ class ExposureDonuts(WavefrontFit):
         double: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
         if self.freedoms is None:
             basis = field_basis(instrument, usable.fields, self.field_noll)
-            hierarchy = fit_hierarchy(observations, basis, air)
+            consistent = fit_consistently(observations, basis, air)
+            hierarchy = consistent.hierarchy
             double = hierarchy.terms.reshape(-1, n), hierarchy.term_covariance
         else:
-            hierarchy, basis, freedoms = self._freedoms(usable, observations, air)
+            consistent, basis, freedoms = self._freedoms(usable, observations, air)
+            hierarchy = consistent.hierarchy
         sides = None
         if behind.any() and not behind.all():
-            sizes = hierarchy.sizes
-            sides = pair_agreement(zernikes, covariance, star, behind, sizes.noise, sizes.air**2 * air.shape)
-            sides = sides or _sides_apart(observations, basis, air, behind)
+            sizes, kept = hierarchy.sizes, ~consistent.left_out
+            pairs = (values[kept] for values in (zernikes, covariance, star, behind))
+            sides = pair_agreement(*pairs, sizes.noise, sizes.air**2 * air.shape)
+            sides = sides or _sides_apart(without(observations, consistent.left_out), basis, air, behind)
         exposure_result = ExposureWavefront(
             instrument.terms.requested,
             hierarchy.total,
@@ -170,7 +174,7 @@ class ExposureDonuts(WavefrontFit):
             0.0 if no_air else hierarchy.sizes.air,
             hierarchy.sizes.noise,
             sides,
-            _notices(hierarchy, sides),
+            _notices(consistent, zernikes, usable.index, sides),
         )
         return FittedStars(
             _results(usable, errors, hierarchy.telescope, hierarchy.telescope_covariance + figure),
@@ -187,7 +191,7 @@ class ExposureDonuts(WavefrontFit):
 
     def _freedoms(
         self, usable: UsableStars, observations: Observations, air: ExposureAir
-    ) -> tuple[Hierarchy, Basis, FreedomEstimate]:
+    ) -> tuple[Consistent, Basis, FreedomEstimate]:
         """Return the wavefronts where the telescope's is made by degrees of freedom, linear about their estimate."""
         assert self.freedoms is not None
         instrument, freedoms = usable.instrument, self.freedoms
@@ -208,11 +212,12 @@ class ExposureDonuts(WavefrontFit):
             believed = coefficients if believed is None else believed
             made = (coefficients - believed)[:, noll - 1] - columns @ (values / spreads)
             basis = Basis(columns, variance=np.ones(len(spreads)))
-            hierarchy = fit_hierarchy(replace(observations, zernikes=observations.zernikes - made), basis, air)
+            consistent = fit_consistently(replace(observations, zernikes=observations.zernikes - made), basis, air)
+            hierarchy = consistent.hierarchy
             values = hierarchy.terms * spreads
         hierarchy = replace(hierarchy, telescope=hierarchy.telescope + made, total=hierarchy.total + made)
         covariance = hierarchy.term_covariance * np.outer(spreads, spreads)
-        return hierarchy, basis, FreedomEstimate(freedoms, values, covariance, spreads)
+        return replace(consistent, hierarchy=hierarchy), basis, FreedomEstimate(freedoms, values, covariance, spreads)
 
 
 def _results(
@@ -245,9 +250,17 @@ def _sides_apart(observations: Observations, basis: Basis, air: ExposureAir, beh
     return SideAgreement(0, float(np.linalg.norm(difference)), np.nan, chi2)
 
 
-def _notices(hierarchy: Hierarchy, sides: SideAgreement | None) -> tuple[str, ...]:
-    """Return what a user should know of the exposure."""
-    notices = []
+def _notices(
+    consistent: Consistent, zernikes: np.ndarray, index: np.ndarray, sides: SideAgreement | None
+) -> tuple[str, ...]:
+    """Return what a user should know of the exposure; ``index`` has the numbers of the donuts among all."""
+    hierarchy, left_out = consistent.hierarchy, consistent.left_out
+    differences = np.linalg.norm(zernikes - hierarchy.telescope, axis=1)
+    notices = [
+        f"donut {number} (from 0) differs by {1e9 * nm:.0f} nm from what the others say of the telescope there: the "
+        "wavefront of the exposure is without it"
+        for number, nm in zip(index[left_out], differences[left_out], strict=True)
+    ]
     own = float(np.sqrt(np.mean(((hierarchy.total - hierarchy.telescope) ** 2).sum(axis=1))))
     if own > _UNLIKE:
         notices.append(

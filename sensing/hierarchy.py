@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -149,6 +150,12 @@ class Sizes:
     bent: float
     local: float
 
+    @classmethod
+    def of(cls, logarithms: np.ndarray) -> Self:
+        """Return those of logarithms; of the fall, that of its logarithm."""
+        noise, rms, linear, fall, bent, local = np.exp(logarithms)
+        return cls(noise, rms, linear, math.exp(fall), bent, local)
+
 
 @dataclass(frozen=True)
 class Hierarchy:
@@ -197,8 +204,7 @@ def fit_hierarchy(observations: Observations, basis: Basis, air: ExposureAir) ->
     model = _Model(observations, basis, air)
     of_field = basis.variance is None
     free = [True, air.rms is None, of_field, of_field, of_field, observations.repeated]
-    local = _LOCAL_RMS if observations.repeated else 1e-3 * _UNIT
-    middle = np.log([1.0, air.rms or AIR_RMS, _LINEAR_RMS, math.log(_FALL), _BENT_RMS, local])
+    middle = _middle(observations, air)
     # Standard deviations of the logarithms of rms are half of those of variances.
     spread = np.array([_SCALE_SPREAD, 0.5 * _WIDE, 0.5 * _WIDE, _FALL_SPREAD, 0.5 * _WIDE, 0.5 * _WIDE])
     least, most = middle - 4.0 * spread, middle + 4.0 * spread
@@ -208,8 +214,7 @@ def fit_hierarchy(observations: Observations, basis: Basis, air: ExposureAir) ->
     def sizes(values: np.ndarray) -> Sizes:
         logarithms = middle.copy()
         logarithms[index] = values
-        noise, rms, linear, fall, bent, local = np.exp(logarithms)
-        return Sizes(noise, rms, linear, math.exp(fall), bent, local)
+        return Sizes.of(logarithms)
 
     def loss(values: np.ndarray) -> float:
         prior = float((((values - middle[index]) / spread[index]) ** 2).sum())
@@ -218,6 +223,20 @@ def fit_hierarchy(observations: Observations, basis: Basis, air: ExposureAir) ->
     bounds = list(zip(least[index], most[index], strict=True))
     best = minimize(loss, middle[index], method="L-BFGS-B", bounds=bounds, options={"eps": 1e-3, "maxiter": 40})
     return model.solved(sizes(best.x), float(best.fun))
+
+
+def chi2_by_the_others(observations: Observations, basis: Basis, air: ExposureAir) -> np.ndarray:
+    """Return chi-square a term of each donut's star about what other stars say of it, shape [n].
+
+    Sizes of the parts are those about which their priors lie; arguments are those of :func:`fit_hierarchy`.
+    """
+    return _Model(observations, basis, air).chi2_by_the_others(Sizes.of(_middle(observations, air)))
+
+
+def _middle(observations: Observations, air: ExposureAir) -> np.ndarray:
+    """Return the logarithms of the sizes about which their priors lie."""
+    local = _LOCAL_RMS if observations.repeated else 1e-3 * _UNIT
+    return np.log([1.0, air.rms or AIR_RMS, _LINEAR_RMS, math.log(_FALL), _BENT_RMS, local])
 
 
 class _Model:
@@ -296,6 +315,21 @@ class _Model:
         scaled = scale * gradient
         determinant = 2.0 * float(np.log(np.diag(factor[0])).sum() - np.log(scale).sum())
         return loss + determinant - float(scaled @ cho_solve(factor, scaled))
+
+    def chi2_by_the_others(self, sizes: Sizes) -> np.ndarray:
+        """Return chi-square a term of each donut's star about what other stars say of it, shape [n]."""
+        curvature, gradient, _, inverses = self._normal(sizes)
+        scale, result = 1.0 / np.sqrt(np.diag(curvature)), np.zeros(self._count)
+        for group, inverse in zip(self._groups, inverses, strict=True):
+            for donuts, precision in zip(group, inverse, strict=True):
+                design = self._design[donuts].reshape(-1, len(scale)) * scale
+                values, weighted = self._values[donuts].ravel(), precision @ design
+                others = curvature * np.outer(scale, scale) - design.T @ weighted
+                covariance = np.linalg.pinv(others, hermitian=True)
+                residual = values - design @ covariance @ (scale * gradient - weighted.T @ values)
+                expected = np.linalg.inv(precision) + design @ covariance @ design.T
+                result[donuts] = residual @ np.linalg.solve(expected, residual) / len(values)
+        return result
 
     def solved(self, sizes: Sizes, loss: float) -> Hierarchy:
         """Return the wavefronts for sizes of the parts."""
