@@ -232,8 +232,9 @@ class StarFitter:
         instrument = self.instrument
         if instrument.known_seeing or not len(solution.shared):
             return False
-        fwhm = max(self._fwhm, float(instrument.seeing.fwhm(solution.stars[0][STRENGTH])))
-        return self._light.diameter < _FEW_WIDTHS * fwhm * self._light.scale
+        # What is far wider is no donut in some seeing.
+        fwhm = np.clip(instrument.seeing.fwhm(solution.stars[0][STRENGTH]), self._fwhm, 2.0 * self._fwhm)
+        return bool(self._light.diameter < _FEW_WIDTHS * fwhm * self._light.scale)
 
     def without_wavefront(self) -> StarFitter:
         """Return the same without unknowns of the wavefront, which is zero."""

@@ -7,6 +7,7 @@ import pytest
 
 from pachon.models.zernike_polynomials import annular_zernikes, noll_to_nm
 from pachon.sensing.air_shape import air_shape
+from pachon.sensing.contradicting_donuts import fit_consistently
 from pachon.sensing.hierarchy import Basis, ExposureAir, Observations, fit_hierarchy, star_numbers
 
 NOLL = np.arange(4, 12)
@@ -100,6 +101,30 @@ def test_errors_are_those_claimed(air, scale):
         assert np.linalg.norm(fit.telescope - telescope) < np.linalg.norm(observations.zernikes - telescope)
     # Eight terms of twelve exposures, much the same at all donuts of one: 15 %.
     np.testing.assert_allclose(np.mean(squares, axis=0), 1.0, atol=0.35)
+
+
+def test_a_donut_that_the_others_contradict_says_nothing_of_the_telescope():
+    """One that is off by 1.5 um made the telescope's wavefront wrong by 100 nm at all others."""
+    air, count = ExposureAir(shape(), GROUND), 12
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        places, exposure = places_of(rng, count), np.zeros(count, dtype=int)
+        # Thirty times as misaligned as the prior has it, too.
+        linear = (150e-9, 1e-6, 5e-6)[seed]
+        options = {"star": np.arange(count), "exposure": exposure, "air": 60e-9, "linear": linear}
+        observations, telescope, _ = drawn(rng, places, **options)
+        basis, one, direction = field_basis(places), int(rng.integers(count)), rng.normal(size=len(NOLL))
+        without = fit_consistently(observations, basis, air)
+        assert not without.left_out.any()
+        wrong = observations.zernikes.copy()
+        wrong[one] += 1.5e-6 * direction / np.linalg.norm(direction)
+        fit = fit_consistently(replace(observations, zernikes=wrong), basis, air)
+        np.testing.assert_array_equal(fit.left_out, np.arange(count) == one)
+        # What the others say of the telescope there, as far as they know it.
+        error, covariance = fit.hierarchy.telescope - telescope, fit.hierarchy.telescope_covariance
+        assert error[one] @ np.linalg.solve(covariance[one], error[one]) < 3.0 * len(NOLL)
+        before = np.linalg.norm(without.hierarchy.telescope - telescope, axis=1)
+        assert np.linalg.norm(np.delete(error, one, axis=0), axis=1).max() < 1.3 * before.max()
 
 
 def test_high_orders_of_bent_mirrors_keep_their_slopes_over_the_field():
