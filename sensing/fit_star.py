@@ -11,6 +11,7 @@ import numpy as np
 from ..models.zernike_polynomials import noll_to_nm
 from .bad_pixels import without_bad_pixels
 from .donut_rays import ZernikeRays
+from .first_search import first_solution
 from .flags import DonutFlag
 from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y
 from .light import Instrument, StarLight
@@ -18,7 +19,7 @@ from .likelihood import Stamp, model_image
 from .neighbours import NeighbourSearch, explains_more
 from .rim_search import MOST_BODIES, RimFit, RimSolver, settled, with_another_rim
 from .sides import CONTRADICTED, BothSides, SideFit
-from .solve import COARSE, FINE, Solution
+from .solve import COARSE, Solution
 from .stamps import Pixels, plane_basis
 from .star_fitter import BRIGHT, SMALLEST_DONUT, StarFitter, StarSolution, Start
 
@@ -55,9 +56,6 @@ _SIZES = (0.92, 1.08)
 #: Largest part of the light that rims which have run away make less than none: a star in focus, for which the fit moved
 #: the rim of M2 by 3 m, has 0.07.
 _NEGATIVE = 0.03
-#: Wavefront that telescopes have, Z4 on, root of the summed squares [m]: of two that explain an image alike the smaller
-#: one is the likelier one.
-_LIKELY = 0.3e-6
 
 
 @dataclass(frozen=True)
@@ -289,9 +287,7 @@ class _Search:
 
 def _search(fitter: StarFitter, start: Start) -> _Search:
     """Return the best coarse solution, with neighbours, and without lines of pixels far off a first one."""
-    best = fitter.solve(start.stamp, start.unknowns, tolerance=COARSE if fitter.donut else FINE)
-    if fitter.may_have_other_seeing(best):
-        best = _simplest(fitter, start, best)
+    best = first_solution(fitter, start)
     search = _Search(fitter, start, best, best)
     if not fitter.donut:
         return search
@@ -300,22 +296,11 @@ def _search(fitter: StarFitter, start: Start) -> _Search:
         if (used != fitter.clean.used).any():
             fitter = fitter.with_used(used)
             start = fitter.start()
-            best = fitter.solve(start.stamp, start.unknowns, tolerance=COARSE)
+            best = first_solution(fitter, start)
             search = _Search(fitter, start, best, best)
     if fitter.instrument.model.neighbours:
         search = replace(search, best=_with_neighbours(search.fitter, search.start, search.best))
     return search
-
-
-def _simplest(fitter: StarFitter, start: Start, best: Solution) -> Solution:
-    """Return the better of a solution and one that begins from the seeing of a star without aberrations.
-
-    Small images have several wavefronts that explain them, in other seeings.
-    """
-    tolerance = COARSE if fitter.donut else FINE
-    plain = fitter.without_wavefront().solve(start.stamp, start.unknowns, tolerance=tolerance)
-    other = fitter.solve(start.stamp, plain.stars[0], tolerance=tolerance)
-    return min(best, other, key=lambda fit: fit.loss + float(fit.shared @ fit.shared) / _LIKELY**2)
 
 
 def _search_of_rims(begun: StarFitter, search: _Search) -> _Search:

@@ -50,9 +50,6 @@ _SHARED = 2.0
 _ENOUGH = 1.25
 #: Cells across the pupil from which on those on rims leave less chi-square than rims that explain an image alike.
 _FOR_RIVALS = 120
-#: Width of an image without air over the FWHM of the seeing below which other wavefronts, in another seeing, explain it
-#: nearly as well. From 8 on (LSST, 300 um) a search goes wrong once in some 50 donuts.
-_FEW_WIDTHS = 8.0
 #: Noll indices without which rims are not searched for.
 _TERMS_FOR_RIMS = np.arange(4, 23)
 
@@ -226,15 +223,6 @@ class StarFitter:
             if across <= cells <= _ENOUGH * across:
                 return rays
         return self._rays.setdefault(across, self.instrument.rays(light, across))
-
-    def may_have_other_seeing(self, solution: Solution) -> bool:
-        """Return whether the image of a solution with a wavefront is so small that another seeing may explain it."""
-        instrument = self.instrument
-        if instrument.known_seeing or not len(solution.shared):
-            return False
-        # What is far wider is no donut in some seeing.
-        fwhm = np.clip(instrument.seeing.fwhm(solution.stars[0][STRENGTH]), self._fwhm, 2.0 * self._fwhm)
-        return bool(self._light.diameter < _FEW_WIDTHS * fwhm * self._light.scale)
 
     def without_wavefront(self) -> StarFitter:
         """Return the same without unknowns of the wavefront, which is zero."""
