@@ -10,11 +10,17 @@ from __future__ import annotations
 import numpy as np
 
 from ...core.errors import DomainError
+from ..atmosphere.turbulence import fried_parameter
 from ..pupil_optics import PupilOptics
 from .image_plane import ImagePlane
 
 #: Largest part of the light of the optics alone that may fall beside a stamp.
 LARGEST_LOSS = 0.05
+# Bend of waves across strips along rims [rad] from which on sums over strips lack something, and path over the pupil
+# [wavelengths] up to which the lattice is quicker than rays: images of 1.2 to 3.5 m telescopes whose waves bend by 1 to
+# 20 were wrong by 0.5 to 2.5 % of the peak. The LSST's bend by 0.05 in focus, by 1.1 with 140 waves at 0.3 mm.
+_LARGEST_BEND = 1.0
+_MOST_WAVES = 100.0
 
 
 def blur_radii(optics: PupilOptics) -> np.ndarray:
@@ -23,6 +29,17 @@ def blur_radii(optics: PupilOptics) -> np.ndarray:
     square = x**2 + y**2
     total = np.sum(square, axis=(1, 2), where=optics.lit)
     return np.asarray(np.sqrt(total / np.maximum(optics.lit.sum(axis=(1, 2)), 1)))
+
+
+def bent_across_strips(optics: PupilOptics, focal_length: float, diameter: float, r0: float) -> np.ndarray:
+    """Return which stars have waves that bend across strips along the rims, and not too many for a lattice, [n_star].
+
+    Strips are a Fried parameter wide, and their sums have the slope of the wave. ``r0`` is that of 500 nm; all in
+    metres.
+    """
+    longest, blur = float(optics.wavelengths.max()), blur_radii(optics) / focal_length
+    bend = 4.0 * np.pi * blur / diameter / longest * float(fried_parameter(r0, longest)) ** 2
+    return np.asarray((bend > _LARGEST_BEND) & (blur * diameter < _MOST_WAVES * longest))
 
 
 def sampling_refinement(optics: PupilOptics, neighbour: float, largest: float, refined: float) -> np.ndarray:

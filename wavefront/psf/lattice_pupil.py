@@ -210,3 +210,14 @@ class LatticeTransfer:
         """Return products of Legendre polynomials over the pupil up to a total degree, shape [n, n_term]."""
         x, y = (np.polynomial.legendre.legvander(u, degree) for u in points.T / (0.5 * self.diameter))
         return np.stack([x[:, t - j] * y[:, j] for t in range(degree + 1) for j in range(t + 1)], axis=1)
+
+
+def laid_out(transfer: np.ndarray, row: np.ndarray, column: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return transfer functions at rows +n and then -n as kernels of spokes lay them out, [4, n_row, n_packet, lane].
+
+    ``shape`` is [n_row, n_packet, lane]; columns are counted over all packets.
+    """
+    laid = np.zeros((4, shape[0], int(np.prod(shape[1:]))), dtype=np.float32)
+    laid[0, row, column], laid[2, row, column] = transfer.real.reshape(2, -1)
+    laid[1, row, column], laid[3, row, column] = transfer.imag.reshape(2, -1)
+    return laid.reshape(4, *shape)

@@ -48,6 +48,7 @@ from ..atmosphere.turbulence import coherence, structure_function
 from ..pupil_optics import PupilOptics
 from .clear_pupil import SpokePupil, clear_edges, has_only_annuli
 from .engine import ExposedStars, PsfEngine, PsfInputs, PsfRenderer, Stars, expose_by_kind, metric_of
+from .far_from_focus import bent_across_strips
 from .lattice_pupil import (
     LATTICE_POINTS,
     MOST_ACROSS,
@@ -55,6 +56,7 @@ from .lattice_pupil import (
     RINGS_POINTS,
     LatticeRays,
     LatticeTransfer,
+    laid_out,
 )
 from .long_exposure_kernels import place_points, sample_pixels, transform_pupils
 from .mean_rays import MeanRaysRenderer, drawing_ray_counts, ray_counts
@@ -262,8 +264,10 @@ class LongExposureRenderer(PsfRenderer):
         bounds = np.array([self.least_lit, *(least for least, _, _ in self.dense)])
         kinds = _NEAR - (lit[:, None] < bounds).sum(axis=1)
         if self._options.n_pupil is None:
+            assert self._atmosphere is not None, "images without air are those of the lattice"
             rays = self._ray_counts(optics)
-            kinds = np.where(rays > 0, rays, kinds)
+            bent = bent_across_strips(optics, self.focal_length, self._diameter, self._atmosphere.r0)
+            kinds = np.where(bent, -1 - len(self.dense), np.where(rays > 0, rays, kinds))
         if (kinds == _NEAR).all():
             return self._expose_spokes(optics, edges, stars, self._pupil)
         near = np.flatnonzero(kinds == _NEAR)
@@ -377,10 +381,7 @@ class LongExposureRenderer(PsfRenderer):
         if photons is not None:
             filters *= photons[star, channels.wave, None]
         total = np.sum(lattice.at(rays, star, channels, k) * filters, axis=0)
-        laid = np.zeros((4, n_row, self._detector[0, 0].size), dtype=np.float32)
-        laid[0, row, column], laid[2, row, column] = total.real.reshape(2, -1)
-        laid[1, row, column], laid[3, row, column] = total.imag.reshape(2, -1)
-        return laid.reshape(4, *self._detector.shape[1:])
+        return laid_out(total, row, column, self._detector.shape[1:])
 
     @cached_property
     def _atmosphere_table(self) -> np.ndarray:
@@ -410,8 +411,7 @@ class LongExposureRenderer(PsfRenderer):
         self, optics: PupilOptics, edges: np.ndarray, photons: np.ndarray | None, pupil: SpokePupil
     ) -> np.ndarray:
         """Return the transfer functions of stars without the detector, as the kernel lays them out."""
-        n_star, _, n_point = optics.lit.shape
-        n_row, n_packet = self._detector.shape[1:3]
+        (n_star, _, n_point), (n_row, n_packet) = optics.lit.shape, self._detector.shape[1:3]
         # Pairs as complex numbers: a tenth of the time.
         places = np.ascontiguousarray(optics.displacement, dtype=np.float32).view(np.complex64)[..., 0]
         landed = np.isfinite(places).all(axis=1).astype(np.float64)

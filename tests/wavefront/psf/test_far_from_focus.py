@@ -84,10 +84,10 @@ def test_long_exposure_donuts_are_random_rays_under_the_mean_atmosphere():
 
 
 @pytest.mark.long
-def test_a_short_camera_is_far_from_focus_sooner():
-    """The aberrations of a Schmidt camera of f/2.5 blur stars by 1.9 arcsec and 28 um: sums over few points ring."""
+def test_a_short_camera_of_strong_aberrations_is_its_waves():
+    """The aberrations of a Schmidt camera of f/2.5 blur stars by 1.9 arcsec and 28 um."""
     schmidt = pachon.new_telescope("schmidt", diameter=1.2, f_number=2.5)
-    opd = pachon.wavefront_opd(schmidt, (0.0, 0.0), WAVE, grid=256)
+    opd = pachon.wavefront_opd(schmidt, (0.0, 0.0), WAVE, grid=512)
     wave = np.where(opd.lit, np.exp(2j * np.pi * np.where(opd.lit, opd.value, 0.0) / WAVE), 0.0)
     count = 2 * len(wave)
     transfer = scipy.fft.fftshift(scipy.fft.ifft2(np.abs(scipy.fft.fft2(wave, (count, count))) ** 2).real)
@@ -99,8 +99,8 @@ def test_a_short_camera_is_far_from_focus_sooner():
     expected = (waves @ transfer @ waves.T).real
     expected /= expected.sum()
     psf = make_psfs(schmidt, [(0.0, 0.0)], [WAVE], atmosphere=air(), engine="long_exposure", stamps=Stamps(41))
-    # Strips along the rims, whose rays land far out, are right to first order: 1.1 % of the peak.
-    assert np.abs(psf.image[0] - expected).max() < 0.015 * expected.max()
+    # By rays and strips along the rims, across which waves bend: 1.1 % of the peak. The grid here leaves 0.1.
+    assert np.abs(psf.image[0] - expected).max() < 0.002 * expected.max()
 
 
 @pytest.mark.long
