@@ -177,8 +177,7 @@ def solve(
     covariance = np.zeros_like(state.curvature)
     free = np.ix_(~held, ~held)
     scale = np.sqrt(np.maximum(np.diag(state.curvature)[~held], 1e-300))
-    covariance[free] = np.linalg.pinv(state.curvature[free] / np.outer(scale, scale), hermitian=True)
-    covariance[free] /= np.outer(scale, scale)
+    covariance[free] = _inverse(state.curvature[free] / np.outer(scale, scale)) / np.outer(scale, scale)
     bounds = np.cumsum([0, *sizes])
     star_unknowns = tuple(joined[a:b] for a, b in itertools.pairwise(bounds))
     best = joined[bounds[-1] :]
@@ -294,3 +293,11 @@ def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
         return np.asarray(cho_solve(cho_factor(matrix), right))
     except np.linalg.LinAlgError:
         return np.linalg.lstsq(matrix, right, rcond=1e-12)[0]
+
+
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    """Return the pseudo-inverse of a positive matrix; eigenvalues that rounding made negative count by their size."""
+    values, vectors = np.linalg.eigh(matrix)
+    sizes = np.abs(values)
+    kept = sizes > 1e-15 * sizes.max(initial=0.0)
+    return np.asarray((vectors[:, kept] / sizes[kept]) @ vectors[:, kept].T)

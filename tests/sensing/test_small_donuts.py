@@ -11,10 +11,10 @@ FIELDS = np.deg2rad([(0.1, 0.05), (0.6, -0.4)])
 TRUE = 1e-9 * np.array([30.0, -20.0, 60.0, -90.0, 70.0, 50.0, -150.0, -20.0])
 
 
-def fitted(telescope, defocus, pixels, fields=FIELDS):
+def fitted(telescope, defocus, pixels, fields=FIELDS, diffraction=None):
     """Return the fit of donuts with the wavefront, and its errors, [n_star, n_noll]."""
     behind = telescope.perturbed("Detector", shift=(0.0, 0.0, defocus))
-    model = pachon.DonutModel(detector=pachon.DonutDetector(10e-6))
+    model = pachon.DonutModel(detector=pachon.DonutDetector(10e-6), diffraction=diffraction)
     light = [telescope.default_wavelength]
     drawn = pachon.draw_donuts(
         behind,
@@ -49,3 +49,11 @@ def test_donuts_of_a_short_camera_have_its_diffracted_light():
     assert fit.diffraction
     assert np.linalg.norm(error) < 25e-9
     assert fit.fwhm[0] < np.deg2rad(0.8 / 3600.0)
+
+
+def test_variances_of_a_star_in_focus_are_positive(focused):
+    """What its pixels do not tell has eigenvalues of the curvature that are rounding, of either sign."""
+    fit, _ = fitted(focused, 20e-6, 41, FIELDS[:1], diffraction=False)
+    for covariance in (fit.covariance[0], *(getattr(fit.error_parts, name)[0] for name in ("photons", "residuals"))):
+        values = np.linalg.eigvalsh(covariance)
+        assert values.min() > -1e-9 * values.max()
