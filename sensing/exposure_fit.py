@@ -163,8 +163,8 @@ class ExposureDonuts(WavefrontFit):
         sides = None
         if behind.any() and not behind.all():
             sizes, kept = hierarchy.sizes, ~consistent.left_out
-            pairs = (values[kept] for values in (zernikes, covariance, star, behind))
-            sides = pair_agreement(*pairs, sizes.noise, sizes.air**2 * air.shape)
+            of_air = sizes.air**2 * air.shape
+            sides = pair_agreement(zernikes[kept], covariance[kept], star[kept], behind[kept], sizes.noise, of_air)
             sides = sides or _sides_apart(without(observations, consistent.left_out), basis, air, behind)
         exposure_result = ExposureWavefront(
             instrument.terms.requested,
