@@ -27,7 +27,7 @@ class Solution:
     """Changes of the variables where a solver stops."""
 
     changes: np.ndarray  #: as the solver has them, shape [n_variable]
-    history: list[float]  #: rms of all residuals before and after each step [m]
+    history: list[float]  #: rms of all residuals, with stated weights, before and after each step [m]
     message: str  #: why it stopped
 
 
@@ -124,7 +124,7 @@ class LeastSquares:
         def jacobian(scaled: np.ndarray) -> np.ndarray:
             # Called at the start and after each step.
             values, change = problem.linear(scaled * scale)
-            history.append(float(np.linalg.norm(values)))
+            history.append(problem.stated_rms(values))
             return change * scale
 
         solution = least_squares(
