@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from ...design.optimize.operand import Operand
     from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
     from ...models.parameters.parameters import Parameter
+    from ...models.telescope import Telescope
 
 _ADDRESSES = "Separated by commas: M2.dx, Camera.* (six motions), M1.radius, M1.conic, M1.a6, M1.Z4-22, L1_entrance.n"
 
@@ -193,7 +194,7 @@ def optimize(
         names(
             completion.addresses,
             metavar="ADDRESS=LOW:HIGH",
-            help="Limits of a variable; of a motion those of its change.",
+            help="Limits of a variable, of a motion those of its change: in SI, or as S1.radius_mm=40:60.",
         ),
     ] = None,
     config: Annotated[
@@ -237,7 +238,7 @@ def optimize(
             DesignConfiguration(*shared.first_arguments, projection=shared.projection),
             name_list(variables or "", "--variables"),
             cast("MeritName", merit or "spots"),
-            bounds=dict(_bounds(text) for text in bounds or ()),
+            bounds=dict(_bounds(shared.telescope, text) for text in bounds or ()),
             targets=() if focal_length is None else (FocalLength(focal_length),),
             threads=shared.threads,
         )
@@ -368,10 +369,17 @@ def _from_to(pair: Any) -> str:
     return f"{pair[0]:.6g} -> {pair[1]:.6g}"
 
 
-def _bounds(text: str) -> tuple[str, tuple[float, float]]:
-    address, _, limits = text.partition("=")
+def _bounds(telescope: Telescope, text: str) -> tuple[str, tuple[float, float]]:
+    """Return address and limits of a bound: in SI, or in the unit at the end of the address, as in files."""
+    from ...models.parameters.changes import ANGLES, LENGTHS, parse_change
+
+    name, _, limits = text.partition("=")
     try:
         low, high = (float(limit) for limit in limits.split(":"))
     except ValueError:
         raise ConfigError(f"--bounds {text}: expected ADDRESS=LOW:HIGH, such as M1.conic=-1.1:-0.9") from None
-    return address.strip(), (low, high)
+    address, size = name.strip(), 1.0
+    if address.rpartition("_")[2] in (*LENGTHS, *ANGLES):
+        parameter, size = parse_change(telescope, address, "--bounds")
+        address = parameter.address
+    return address, (size * low, size * high)
