@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 
 _ADDRESSES = "Separated by commas: M2.dx, Camera.* (six motions), M1.radius, M1.conic, M1.a6, M1.Z4-22, L1_entrance.n"
 
+#: Addresses for messages.
+_EXAMPLE = "M2.dx,M1.radius"
+
 
 def _largest_terms(result: Any) -> list[str]:
     """Return the three Noll terms of each parameter that change most over the fields."""
@@ -117,7 +120,9 @@ def sensitivity(
     if degrees_of_freedom is not None:
         variables = load_degrees_of_freedom(degrees_of_freedom)
     else:
-        variables = usual_parameters(telescope) if parameters is None else name_list(parameters, "--parameters")
+        variables = (
+            usual_parameters(telescope) if parameters is None else name_list(parameters, "--parameters", _EXAMPLE)
+        )
     result = compute(telescope, variables, *where, n_zernike=zernikes, **shared.trace_options)
     path = out or Path(f"sensitivity_{shared.stem}.fits")
     write_sensitivity(path, result)
@@ -236,7 +241,7 @@ def optimize(
         _check_out(shared, out)
         result = compute(
             DesignConfiguration(*shared.first_arguments, projection=shared.projection),
-            name_list(variables or "", "--variables"),
+            name_list(variables or "", "--variables", _EXAMPLE),
             cast("MeritName", merit or "spots"),
             bounds=dict(_bounds(shared.telescope, text) for text in bounds or ()),
             targets=() if focal_length is None else (FocalLength(focal_length),),

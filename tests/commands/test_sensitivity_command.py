@@ -65,6 +65,7 @@ def test_optimize_writes_a_prescription(tmp_path, capsys):
     [
         (["sensitivity", "paul_baker", "--parameters", "M9.dz"], "M9"),
         (["sensitivity", "paul_baker", "--out", "matrix.txt"], ".fits or .ecsv"),
+        (["sensitivity", "paul_baker", "--parameters", ","], "such as M2.dx,M1.radius"),
         (["optimize", "paul_baker", "--variables", "M2.rz"], "M2.rz has no effect"),
         (["optimize", "paul_baker", "--variables", "M2.dz", "--merit", "speed"], "speed"),
         (["optimize", "paul_baker", "--variables", "M2.dz", "--bounds", "M2.dz"], "ADDRESS=LOW:HIGH"),
