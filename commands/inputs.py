@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
     from ..models.telescope import Telescope
     from ..pipeline.config import Configuration as RunConfiguration
     from ..pipeline.experiment import Experiment
+
+#: Distance of a stop from the entrance pupil, in diameters of this, that no tolerance would have.
+_ASIDE = 0.05
 
 
 def configuration(
@@ -57,6 +61,30 @@ def load_model(
 
     with warnings_shown(PrescriptionWarning):
         return load_telescope(model, lenient=lenient, glass_catalogues=glass_catalogues, configuration=configuration)
+
+
+def print_doubts(telescope: Telescope) -> None:
+    """Warn of a telescope that has no detector, or a stop aside of the light that is to fill it.
+
+    As in Zemax, rays fill the entrance pupil about the axis of the object space unless they are aimed at the stop.
+    """
+    from ..models.surface import Interaction
+
+    *surfaces, last = telescope.surfaces
+    if last.interaction != Interaction.DETECTOR:
+        print_warning(f"{telescope.name}: the last surface, {last.name}, is no detector: light is measured on it")
+    data = telescope.design_data
+    stop = next((i for i, s in enumerate(surfaces) if s.name == data.stop), None)
+    if stop is None or data.aiming != "off" or any(s.interaction != Interaction.PASS for s in surfaces[:stop]):
+        return
+    aside = [v - c for v, c in zip(surfaces[stop].vertex, telescope.pupil_center, strict=False)]
+    if math.hypot(*aside) > _ASIDE * telescope.pupil_diameter:
+        name, unit = telescope.length_unit
+        where = " and ".join(f"{v / unit:.6g} {name} in {axis}" for v, axis in zip(aside, "xy", strict=True) if v)
+        print_warning(
+            f"{telescope.name}: the stop {data.stop} lies {where} beside the entrance pupil that rays fill: "
+            "aim them at it, by --aiming real, or move the pupil (stop.center)"
+        )
 
 
 @contextmanager

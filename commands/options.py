@@ -165,11 +165,11 @@ def recipe_of_options(
     )
 
 
-def name_list(text: str, option: str) -> tuple[str, ...]:
-    """Return the names in a text with commas; there must be one."""
+def name_list(text: str, option: str, example: str = "R22_S11,R22_S12") -> tuple[str, ...]:
+    """Return the names in a text with commas; there must be one, such as in the example."""
     names = tuple(name.strip() for name in text.split(",") if name.strip())
     if not names:
-        raise ConfigError(f"{option} = {text!r}: expected names separated by commas, such as R22_S11,R22_S12")
+        raise ConfigError(f"{option} = {text!r}: expected names separated by commas, such as {example}")
     return names
 
 

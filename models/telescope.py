@@ -142,6 +142,9 @@ class Telescope(Pictured):
         for key in ("pupil_diameter", "launch_distance", "reference_sphere_radius", "field_radius", "field_limit"):
             if not (np.isfinite(getattr(self, key)) and getattr(self, key) > 0):
                 raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected a positive number")
+        if self.field_radius > self.field_limit * (1 + 1e-12):
+            radius, limit = (f"{math.degrees(v):.6g} deg" for v in (self.field_radius, self.field_limit))
+            raise PrescriptionError(f"field_radius = {radius}: expected at most the field_limit, {limit}")
         for key in ("stop_z", "pupil_center"):
             if not np.isfinite(getattr(self, key)).all():
                 raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected a finite number")
@@ -156,7 +159,9 @@ class Telescope(Pictured):
             object.__setattr__(self, "band", (low, high))
         for key, values in (("default_wavelength", (self.default_wavelength,)), ("band", self.band or ())):
             if not all(low <= v <= high for v in values):
-                raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected within the wavelength range")
+                raise PrescriptionError(
+                    f"{key} = {getattr(self, key)!r}: expected within the wavelength range, {low:g} to {high:g} m"
+                )
         self.design_data.check_within(names, self.wavelength_range, self.default_wavelength, self.object_distance)
         frames = {g: self.group_frames.get(g) or self._surface_frame(m[0]) for g, m in self.groups.items()}
         object.__setattr__(self, "groups", MappingProxyType({g: tuple(m) for g, m in self.groups.items()}))

@@ -22,7 +22,7 @@ from ...core.file_names import file_name
 from ...core.terminal import print_line
 from .. import options
 from ..imports import import_modules
-from ..inputs import load_model
+from ..inputs import load_model, print_doubts
 from ..interrupt import interruptible
 from ..tables import Column, Rows, numbers_of, print_json
 
@@ -97,7 +97,10 @@ class SharedOptions:
     def telescope(self) -> Telescope:
         """The telescope."""
         telescope = load_model(self.model, self.lenient, self.glass_catalogue or (), self.configuration)
-        return telescope if self.aiming is None else telescope.with_design(aiming=self.aiming)
+        if self.aiming is not None:
+            telescope = telescope.with_design(aiming=self.aiming)
+        print_doubts(telescope)
+        return telescope
 
     @cached_property
     def stem(self) -> str:

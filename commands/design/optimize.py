@@ -29,8 +29,12 @@ if TYPE_CHECKING:
     from ...design.optimize.operand import Operand
     from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
     from ...models.parameters.parameters import Parameter
+    from ...models.telescope import Telescope
 
 _ADDRESSES = "Separated by commas: M2.dx, Camera.* (six motions), M1.radius, M1.conic, M1.a6, M1.Z4-22, L1_entrance.n"
+
+#: Addresses for messages.
+_EXAMPLE = "M2.dx,M1.radius"
 
 
 def _largest_terms(result: Any) -> list[str]:
@@ -116,7 +120,9 @@ def sensitivity(
     if degrees_of_freedom is not None:
         variables = load_degrees_of_freedom(degrees_of_freedom)
     else:
-        variables = usual_parameters(telescope) if parameters is None else name_list(parameters, "--parameters")
+        variables = (
+            usual_parameters(telescope) if parameters is None else name_list(parameters, "--parameters", _EXAMPLE)
+        )
     result = compute(telescope, variables, *where, n_zernike=zernikes, **shared.trace_options)
     path = out or Path(f"sensitivity_{shared.stem}.fits")
     write_sensitivity(path, result)
@@ -193,7 +199,7 @@ def optimize(
         names(
             completion.addresses,
             metavar="ADDRESS=LOW:HIGH",
-            help="Limits of a variable; of a motion those of its change.",
+            help="Limits of a variable, of a motion those of its change: in SI, or as S1.radius_mm=40:60.",
         ),
     ] = None,
     config: Annotated[
@@ -235,9 +241,9 @@ def optimize(
         _check_out(shared, out)
         result = compute(
             DesignConfiguration(*shared.first_arguments, projection=shared.projection),
-            name_list(variables or "", "--variables"),
+            name_list(variables or "", "--variables", _EXAMPLE),
             cast("MeritName", merit or "spots"),
-            bounds=dict(_bounds(text) for text in bounds or ()),
+            bounds=dict(_bounds(shared.telescope, text) for text in bounds or ()),
             targets=() if focal_length is None else (FocalLength(focal_length),),
             threads=shared.threads,
         )
@@ -368,10 +374,17 @@ def _from_to(pair: Any) -> str:
     return f"{pair[0]:.6g} -> {pair[1]:.6g}"
 
 
-def _bounds(text: str) -> tuple[str, tuple[float, float]]:
-    address, _, limits = text.partition("=")
+def _bounds(telescope: Telescope, text: str) -> tuple[str, tuple[float, float]]:
+    """Return address and limits of a bound: in SI, or in the unit at the end of the address, as in files."""
+    from ...models.parameters.changes import ANGLES, LENGTHS, parse_change
+
+    name, _, limits = text.partition("=")
     try:
         low, high = (float(limit) for limit in limits.split(":"))
     except ValueError:
         raise ConfigError(f"--bounds {text}: expected ADDRESS=LOW:HIGH, such as M1.conic=-1.1:-0.9") from None
-    return address.strip(), (low, high)
+    address, size = name.strip(), 1.0
+    if address.rpartition("_")[2] in (*LENGTHS, *ANGLES):
+        parameter, size = parse_change(telescope, address, "--bounds")
+        address = parameter.address
+    return address, (size * low, size * high)

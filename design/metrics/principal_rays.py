@@ -210,8 +210,8 @@ def principal_rays_of(request: Request) -> PrincipalRays:
     moved = position[:, [1, 2], 0] - position[:, [3, 4], 0]
     rotated = direction[:, [1, 2], 0] - direction[:, [3, 4], 0]
     on_image = np.linalg.norm(image[:, [1, 2], 0] - image[:, [3, 4], 0], axis=-1)
-    scale = np.linalg.norm(sky[:, [1, 2]] - sky[:, [3, 4]], axis=-1) / on_image
     with np.errstate(divide="ignore", invalid="ignore"):
+        scale = np.linalg.norm(sky[:, [1, 2]] - sky[:, [3, 4]], axis=-1) / on_image
         distance = -(moved * rotated).sum(axis=-1) / (rotated**2).sum(axis=-1)
         pupil_center = chief_position + distance.mean(axis=1)[:, None] * chief_direction
         # The plane of the exit pupil is parallel to the detector.

@@ -7,19 +7,25 @@ next solution lies beyond the stated one by that deviation; Hestenes, J. Optim. 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
 
+from ...models.telescope import Telescope
 from .operand import GoalOperand, Operand
+from .problem import DesignState
 
 #: Fraction of its deviation that an operand has to lose in a step, else its weight grows.
 _SLOW = 0.3
 #: Factor of such a weight.
 _HEAVIER = 100.0
-#: How often a weight grows before the operand is given up.
-_MOST_FACTORS = 2
+#: Factor of the stated weight at first. Where a number is constant along a curve, a heavy operand allows short steps
+#: only, and the solver stops far from the best merit. Goals that move hold an operand of any weight.
+_FIRST_FACTOR = 0.01
+#: How often a weight grows before the operand is given up, which is to 10 000 times the stated one.
+_MOST_FACTORS = 3
 
 
 def deviation(operand: Operand, number: float) -> float:
@@ -96,3 +102,27 @@ class HeldOperand:
             self.factor *= _HEAVIER
             # The force on the variables, weight squared times shift, stays.
             self.shift /= _HEAVIER**2
+
+
+#: Operands with goals that move, of each configuration.
+HeldOperands = tuple[tuple[HeldOperand, ...], ...]
+
+
+def held_operands(operands: Sequence[Sequence[Operand]], *, exactly: bool) -> HeldOperands:
+    """Return operands of configurations with the first of their goals and weights: the stated ones unless `exactly`."""
+    factor = _FIRST_FACTOR if exactly else 1.0
+    return tuple(tuple(HeldOperand(operand, factor=factor) for operand in each) for each in operands)
+
+
+def with_operands(
+    states: Sequence[DesignState], held: HeldOperands, telescopes: Sequence[Telescope]
+) -> tuple[DesignState, ...]:
+    """Return states with operands of moved goals, and with what these take from telescopes."""
+    return tuple(
+        replace(
+            state,
+            operands=tuple(goal.shifted.bound(telescope) for goal in goals),
+            factors=tuple(goal.factor for goal in goals),
+        )
+        for state, goals, telescope in zip(states, held, telescopes, strict=True)
+    )

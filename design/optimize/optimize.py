@@ -16,6 +16,7 @@ from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
 from .configuration import DesignConfiguration, configurations
 from .design_task import DesignTask
+from .held_operands import held_operands, with_operands
 from .jacobian import ParameterColumns
 from .merit import Beams, Merit
 from .merit_function import MeritFunction, MeritName, merit_function
@@ -100,6 +101,8 @@ def optimize(
     solver = solver or LeastSquares()
     states = task.states()
     telescopes = [state.telescope for state in states]
+    held = held_operands(task.operands, exactly=np.isfinite(solver.constraint_tolerance))
+    states = with_operands(states, held, telescopes)
     problem = DesignProblem(states, free_variables(telescopes, variables))
     box = limits(telescopes, problem.variables, bounds or {})
     start, slopes = problem.linear(np.zeros(len(problem.variables)))
@@ -110,7 +113,7 @@ def optimize(
     def resume(changed: DesignProblem, changes: np.ndarray) -> np.ndarray:
         return solver.resume(changed, box, changes, effect)
 
-    end = settle(task, problem, solution.changes, resume, solver.constraint_tolerance)
+    end = settle(task, problem, held, solution.changes, resume, solver.constraint_tolerance)
     values, slopes = end.problem.linear(end.changes)
     history = np.array([*solution.history, np.linalg.norm(values)])
     rate = np.array([v.rate(x) for v, x in zip(problem.variables, end.changes, strict=True)])

@@ -18,13 +18,17 @@ from .variables import Variable
 
 @dataclass(frozen=True)
 class DesignState:
-    """A telescope with its merit, the rays of it, operands and weight in the mean square."""
+    """A telescope with its merit, the rays of it, operands and weight in the mean square.
+
+    `factors` are those of the stated weights that are in the operands; empty where all are 1.
+    """
 
     telescope: Telescope
     beams: Beams
     merit: Merit
     operands: tuple[Operand, ...]
     weight: float
+    factors: tuple[float, ...] = ()
 
 
 @dataclass
@@ -91,6 +95,16 @@ class DesignProblem:
             sizes = state.merit.size_of_terms(ParameterColumns.at(state.telescope, parameters))
             squares[places] += state.weight * sizes**2
         return np.sqrt(squares)
+
+    def stated_rms(self, residuals: np.ndarray) -> float:
+        """Return the rms of residuals [m], those of operands with the stated weights."""
+        factors = np.ones(len(residuals))
+        first = 0
+        for state, (merit, operands) in zip(self.states, self.sizes, strict=True):
+            first += merit
+            factors[first : first + operands] = state.factors or 1.0
+            first += operands
+        return float(np.linalg.norm(residuals / factors))
 
     def merit_part(self, residuals: np.ndarray) -> np.ndarray:
         """Return the residuals [m] of the merits without those of the operands."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
@@ -13,9 +13,9 @@ from ...models.paraxial import following_pupil, following_stop, stop_makes_pupil
 from ...models.telescope import Telescope
 from ...wavefront.vignetting_factors import with_vignetting_factors
 from .design_task import DesignTask
-from .held_operands import HeldOperand, allowed_deviation
+from .held_operands import HeldOperand, HeldOperands, allowed_deviation, held_operands, with_operands
 from .optimum import OperandChange
-from .problem import DesignProblem, DesignState
+from .problem import DesignProblem
 
 #: Relative difference of the merit of the solver from the measured one that is an error.
 _DIFFERENT = 1e-2
@@ -24,7 +24,7 @@ _ROUNDING = 1e-9
 #: Kinds of fields whose angles change with the telescope.
 _IMAGE_HEIGHTS = ("paraxial_image_height", "real_image_height")
 #: Most solutions after the first one.
-_ROUNDS = 8
+_ROUNDS = 12
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,7 @@ class Settled:
 def settle(
     task: DesignTask,
     problem: DesignProblem,
+    held: HeldOperands,
     changes: np.ndarray,
     resume: Callable[[DesignProblem, np.ndarray], np.ndarray],
     tolerance: float,
@@ -56,7 +57,6 @@ def settle(
         If the measured merit differs from that of the solver by more than one per cent all the same.
     """
     start = task.measured([state.telescope for state in problem.states], filled=True)
-    held = tuple(tuple(map(HeldOperand, operands)) for operands in task.operands)
     weighted_end = changes
     for count in range(_ROUNDS + 1):
         solved = problem.telescopes(changes)
@@ -76,7 +76,7 @@ def settle(
             changes = weighted_end
             solved = problem.telescopes(changes)
         states = problem.states if same else task.remade(solved)
-        problem = DesignProblem(_with_operands(states, held, solved), problem.variables)
+        problem = DesignProblem(with_operands(states, held, solved), problem.variables)
         changes = resume(problem, changes)
     if not same:
         name = ", ".join(t.name for t in telescopes)
@@ -88,13 +88,13 @@ def settle(
             f"{name}: the rays of the optimisation have a merit of {merit:.6g} m at its end, and the telescope as it "
             f"would be saved {measured:.6g} m: expected them within {_DIFFERENT:.0%}{advice}"
         )
-    stated = tuple(tuple(HeldOperand(goal.stated) for goal in goals) for goals in held)
+    stated = held_operands(task.operands, exactly=False)
     return Settled(
-        DesignProblem(_with_operands(problem.states, stated, solved), problem.variables), changes, telescopes, operands
+        DesignProblem(with_operands(problem.states, stated, solved), problem.variables), changes, telescopes, operands
     )
 
 
-def _moved_goals(held: tuple[tuple[HeldOperand, ...], ...], operands: tuple[OperandChange, ...]) -> list[HeldOperand]:
+def _moved_goals(held: HeldOperands, operands: tuple[OperandChange, ...]) -> list[HeldOperand]:
     """Move the goals of operands that are not held; return those that have moved or were given up."""
     moved = []
     for goal, change in zip(chain.from_iterable(held), operands, strict=True):
@@ -108,16 +108,6 @@ def _moved_goals(held: tuple[tuple[HeldOperand, ...], ...], operands: tuple[Oper
                 # Goals that are farther than they need to be come back.
                 goal.move(change.end, change.allowed)
     return moved
-
-
-def _with_operands(
-    states: Sequence[DesignState], held: tuple[tuple[HeldOperand, ...], ...], solved: Sequence[Telescope]
-) -> tuple[DesignState, ...]:
-    """Return states with operands of moved goals, and with what these take from solved telescopes."""
-    return tuple(
-        replace(state, operands=tuple(goal.shifted.bound(telescope) for goal in goals))
-        for state, goals, telescope in zip(states, held, solved, strict=True)
-    )
 
 
 def _operand_changes(

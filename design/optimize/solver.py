@@ -16,6 +16,9 @@ from .variables import random_starts
 
 #: Effect of the longest first step, in units of the merit at the start.
 _FIRST_STEP = 100.0
+#: How often the solver begins where derivatives were last finite, and the factor of its first step each time.
+_ATTEMPTS = 5
+_SHORTER = 0.01
 #: Tolerance of solutions that begin at another one: operands are held more exactly than merits are minimised.
 _RESUMED = 1e-8
 #: Most evaluations of such a solution, which is near its start.
@@ -27,7 +30,7 @@ class Solution:
     """Changes of the variables where a solver stops."""
 
     changes: np.ndarray  #: as the solver has them, shape [n_variable]
-    history: list[float]  #: rms of all residuals before and after each step [m]
+    history: list[float]  #: rms of all residuals, with stated weights, before and after each step [m]
     message: str  #: why it stopped
 
 
@@ -120,27 +123,68 @@ class LeastSquares:
     ) -> tuple[OptimizeResult, list[float]]:
         """Return the solution in variables over their scale, and the rms of all residuals before and after steps."""
         history: list[float] = []
+        # Generous first steps: variables that compensate each other move far for little effect.
+        first_step = max(_FIRST_STEP * float(np.linalg.norm(residuals)), float(np.finfo(float).tiny))
+        origin, begin = np.zeros(len(scale)), start / scale
+        for attempt in range(_ATTEMPTS):
+            try:
+                solution = self._solution(problem, box, origin, begin, scale, first_step, history)
+            except _NoDerivativesError as lost:
+                if lost.before is None or attempt == _ATTEMPTS - 1:
+                    break
+                # Steps of a solver that begins at 0 are no longer than the first one.
+                origin, begin, first_step = lost.before, np.zeros(len(scale)), _SHORTER * first_step
+            else:
+                solution.x = origin + solution.x
+                return solution, history
+        names = ", ".join(variable.address for variable in problem.variables)
+        raise DomainError(
+            f"the merit has no derivatives on the way of {names}: expected bounds that keep to the surfaces"
+        )
+
+    def _solution(
+        self,
+        problem: DesignProblem,
+        box: tuple[np.ndarray, np.ndarray],
+        origin: np.ndarray,
+        begin: np.ndarray,
+        scale: np.ndarray,
+        first_step: float,
+        history: list[float],
+    ) -> OptimizeResult:
+        """Return the solution relative to an origin, all in variables over their scale; appends to the history."""
+        before: np.ndarray | None = None
 
         def jacobian(scaled: np.ndarray) -> np.ndarray:
             # Called at the start and after each step.
-            values, change = problem.linear(scaled * scale)
-            history.append(float(np.linalg.norm(values)))
+            nonlocal before
+            values, change = problem.linear((origin + scaled) * scale)
+            if not np.isfinite(change).all():
+                raise _NoDerivativesError(before)
+            history.append(problem.stated_rms(values))
+            before = origin + scaled
             return change * scale
 
-        solution = least_squares(
-            lambda scaled: problem.residuals(scaled * scale),
-            start / scale,
+        return least_squares(
+            lambda scaled: problem.residuals((origin + scaled) * scale),
+            begin,
             jac=jacobian,
-            bounds=(box[0] / scale, box[1] / scale),
+            bounds=(box[0] / scale - origin, box[1] / scale - origin),
             method="trf",
-            # Generous first steps: variables that compensate each other move far for little effect.
-            x_scale=float(max(_FIRST_STEP * float(np.linalg.norm(residuals)), np.finfo(float).tiny)),
+            x_scale=first_step,
             ftol=self.tolerance,
             xtol=self.tolerance,
             gtol=1e-15,
             max_nfev=self.max_steps,
         )
-        return solution, history
+
+
+class _NoDerivativesError(Exception):
+    """A step has led to where derivatives are not finite, as at the equator of a surface."""
+
+    def __init__(self, before: np.ndarray | None) -> None:
+        super().__init__()
+        self.before = before  #: variables over their scale before that step; None at the start
 
 
 def _scale(effect: np.ndarray) -> np.ndarray:

@@ -151,16 +151,14 @@ def limits(
 
 def _given(variable: Variable, pair: tuple[float, float]) -> tuple[float, float]:
     low, high = (float(v) for v in pair)
+    unit = "" if variable.parameter.unit in ("", "1") else f" {variable.parameter.unit}"
+    stated = f"bounds of {variable.address} = ({low:g}, {high:g}){unit}"
     if not low < high or not low <= variable.start <= high:
-        raise DomainError(
-            f"bounds of {variable.address} = ({low:g}, {high:g}): expected rising ones about its {variable.start:.6g}"
-        )
+        raise DomainError(f"{stated}: expected rising ones about its {variable.start:.6g}{unit}")
     if not variable.inverse:
         return low, high
     if low < 0.0 < high:
-        raise DomainError(
-            f"bounds of {variable.address} = ({low:g}, {high:g}): expected radii of one sign; a curvature can have both"
-        )
+        raise DomainError(f"{stated}: expected radii of one sign; a curvature can have both")
     ends = 1.0 / high if high else -np.inf, 1.0 / low if low else np.inf
     return min(ends), max(ends)
 

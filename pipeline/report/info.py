@@ -21,7 +21,11 @@ from ...models.io.yaml.values import Turn, flow
 from ...models.io.yaml.writer import INTERACTION_NAMES
 from ...models.media.medium import ConstantIndex
 from ...models.parabasal import parabasal_optics
-from ...models.shapes.shape import Rotational
+from ...models.parameters.shape_terms import term_unit
+from ...models.shapes.grid import GridSag
+from ...models.shapes.mesh import MeshSurface
+from ...models.shapes.shape import Plane, Rotational, Shape
+from ...models.shapes.sum import Sum
 from ...models.surface import Surface
 from ...models.telescope import Telescope
 from ...models.unfolding import axial_heights, unfolded_axis
@@ -150,8 +154,24 @@ def _surface_entry(surface: Surface, height: float, following: float | None, wav
         "medium_after": "" if isinstance(medium, ConstantIndex) else "glass",
         "clear_m": _clear_radii(surface),
         "aperture": flow(aperture_items(surface.aperture), _degrees)[1:-1],
+        "shape_terms": [] if isinstance(shape, (Plane, Rotational)) else _shape_terms(shape),
         "grating": None if surface.grating is None else str(surface.grating),
     }
+
+
+def _shape_terms(shape: Shape) -> list[dict[str, Any]]:
+    """Return the numbers of a shape that is not conic or even asphere, by their addresses, in SI; zeros left out.
+
+    Grids and meshes have none; of a radius and its curvature the radius stands.
+    """
+    terms = []
+    for name, value in shape.parameters.items():
+        component, inner = shape.place(name) if isinstance(shape, Sum) else (shape, name)
+        if isinstance(component, (GridSag, MeshSurface)) or inner.startswith("curvature"):
+            continue
+        if value and math.isfinite(value):
+            terms.append({"name": name, "value": value, "unit": term_unit(component, inner)})
+    return terms
 
 
 def _degrees(value: float) -> str:
@@ -211,15 +231,24 @@ def surface_rows(description: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def coefficient_lines(description: dict[str, Any]) -> list[str]:
-    """Return the coefficients of the aspheres, and the gratings, as text, a line each."""
+    """Return the coefficients of aspheres, the terms of other shapes, and the gratings, as text, a line each."""
     unit, lines = LENGTH_UNITS[description["length_unit"]], []
     for s in description["surfaces"]:
         terms = [(4 + 2 * i, c * unit ** (3 + 2 * i)) for i, c in enumerate(s["coefficients"])]
         if any(c for _, c in terms):
             lines.append(f"{s['name']}: " + ", ".join(f"{c:.9g} r^{power}" for power, c in terms if c))
+        if s["shape_terms"]:
+            lines.append(f"{s['name']}: " + ", ".join(_term_text(term, unit) for term in s["shape_terms"]))
         if s["grating"]:
             lines.append(f"{s['name']}: {s['grating']}")
     return lines
+
+
+def _term_text(term: dict[str, Any], unit: float) -> str:
+    """Return name and value of a term of a shape, lengths in a unit [m]."""
+    base, _, exponent = term["unit"].partition("^")
+    power = {"": 0, "m": int(exponent or 1), "1/m": -1}[base]
+    return f"{term['name']} {term['value'] / unit**power:.9g}"
 
 
 def figure_rows(description: dict[str, Any]) -> list[tuple[str, str]]:

@@ -201,11 +201,11 @@ def summary(table: SweepTable, sweep: SweepFile) -> dict[str, Any]:
 
 def verdict(summary: dict[str, Any]) -> str:
     """Return the result of a sweep in one sentence: the parameter that matters most for its first metric."""
-    failed = summary["failed"]
-    lost = f" {failed} of {summary['points'] + failed} points could not be computed." if failed else ""
+    failed, points = summary["failed"], summary["points"]
+    lost = f" {failed} of {points} points could not be computed." if failed else ""
     metrics = {metric: entry for metric, entry in summary["metrics"].items() if entry["range"] is not None}
     if not metrics:
-        return f"No metric has a value at any of the {summary['points']} computed points.{lost}"
+        return f"No metric has a value at any of the {points - failed} computed points.{lost}"
     # Correlations first, as in the pictures.
     for metric in sorted(metrics, key=lambda name: (not name.startswith("xi"), name)):
         unit = described_metric(metric)[0]
@@ -225,7 +225,7 @@ def verdict(summary: dict[str, Any]) -> str:
             )
             matters = "matters most for" if len(metrics[metric][key]) > 1 else "is the one parameter of"
             return f"{first} {matters} {metric}, {words} {size:+{form}}{of_unit}{second}.{lost}"
-    return f"No parameter changes a metric over the {summary['points']} computed points.{lost}"
+    return f"No parameter changes a metric over the {points - failed} computed points.{lost}"
 
 
 def _is_numeric(table: SweepTable, name: str) -> bool:

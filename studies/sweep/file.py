@@ -19,6 +19,7 @@ of the prescription (``M2.dz_um``, ``M1.Z5_nm``): see :mod:`pachon.studies.sweep
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -43,10 +44,14 @@ EXAMPLES = Path(__file__).parent / "examples"
 Value = Annotated[
     float | str | bool | int,
     checked(
-        lambda value: plain_number(value) if isinstance(value, float | str | bool | int) else None,
-        "a number, a text, true or false",
+        lambda value: plain_number(value) if _is_value(value) else None,
+        "a finite number, a text, true or false",
     ),
 ]
+
+
+def _is_value(value: object) -> bool:
+    return isinstance(value, str | bool | int) or (isinstance(value, float) and math.isfinite(value))
 
 
 class SweptParameter(Section):

@@ -72,6 +72,8 @@ def check_telescope_sweep(sweep: SweepFile, parameters: Point, folder: Path) -> 
     telescope, _ = point_telescope(sweep, parameters, folder)
     for name in sweep.compensators:
         parse_change(telescope, name, "compensators")
+    if sweep.fields_deg is not None:
+        telescope.check_field(*np.deg2rad(sweep.fields_deg).T)
 
 
 def _path(name: str, folder: Path) -> str:

@@ -26,6 +26,8 @@ from .file import ToleranceFile, ToleranceSection
 
 #: Compound tolerances: two motions of one body each.
 _PAIRS = {"tilt": ("rx", "ry"), "decentre": ("dx", "dy")}
+#: Units of compound tolerances, for messages.
+_USUAL_UNITS = {"tilt": "arcmin", "decentre": "um", "wedge": "arcmin", "irregularity": "nm"}
 #: End of the names of the deformations of irregularities.
 _IRREGULAR = "_irregularity"
 
@@ -165,6 +167,10 @@ class _Maker:
             return self._alike(section, [DegreeOfFreedom(section.name, "1", {address: percent})])
         if kind == "irregularity" and unit in LENGTHS:
             return self._irregularity(section, body, unit)
+        without_unit = quantity if quantity in _USUAL_UNITS else kind
+        if without_unit in _USUAL_UNITS:
+            expected = f"{body}.{without_unit}_{_USUAL_UNITS[without_unit]}"
+            raise ConfigError(f"{section.name}: expected its unit at the end, such as {expected}")
         return self._alike(section, [self.freedom(section.name)])
 
     def freedom(self, name: str) -> DegreeOfFreedom:

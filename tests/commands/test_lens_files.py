@@ -1,6 +1,7 @@
 """Lens files on the command line: their own fields, wavelengths and units, ray aiming, glasses, lost fields."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from pachon.commands.cli import main
 from pachon.design.layout.layout import layout
 from pachon.design.metrics.spots import spots
 from pachon.models.io.prescription import load_telescope, save_telescope
+from pachon.models.shapes.shape import Plane
+from pachon.models.surface import Interaction
 
 DATA = Path(__file__).parents[1] / "data" / "zmx"
 WIDE, LENS, FINITE = (
@@ -151,3 +154,19 @@ def test_a_long_table_of_ghosts_says_what_it_leaves_out(in_folder, capsys):
 def test_the_lenses_of_a_file_are_its_bodies(in_folder, capsys):
     found = metrics(capsys, "sensitivity", LENS, "--zernikes", "6", "--field-deg", "0", "--out", "m.fits")
     assert {name.split(".")[0] for name in found["parameters"]} == {"L1", "L2", "L3"}
+
+
+def test_a_stop_beside_the_light_and_a_missing_detector_are_said(in_folder, capsys):
+    """Coordinate breaks about a stop move it from the entrance pupil; without ray aiming no light passes it."""
+    telescope = load_telescope("paul_baker")
+    first, *others = telescope.surfaces
+    stop = replace(first, name="stop", interaction=Interaction.PASS, shape=Plane(), vertex=(0.0, 12.5, 30.0))
+    aside = replace(telescope, name="aside", surfaces=(stop, first, *others)).with_design(stop="stop")
+    save_telescope(aside, "aside.yaml")
+    assert main(["spots", "aside.yaml", *FEW, "--picture", "picture.png"]) == 0
+    assert "the stop stop lies 12.5 m in y beside the entrance pupil that rays fill" in capsys.readouterr().err
+    save_telescope(replace(telescope, name="blind", surfaces=telescope.surfaces[:-1]), "blind.yaml")
+    assert main(["spots", "blind.yaml", *FEW, "--field-deg", "0", "--picture", "picture.png"]) == 0
+    assert capsys.readouterr().err == (
+        "pachon: warning: blind: the last surface, M3, is no detector: light is measured on it\n"
+    )

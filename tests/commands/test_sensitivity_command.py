@@ -54,6 +54,8 @@ def test_optimize_writes_a_prescription(tmp_path, capsys):
     assert printed["rms_end_m"] < 0.2 * printed["rms_start_m"]
     written = pachon.load_telescope(str(tmp_path / "optimized_paul_baker.yaml"))
     assert written.surface("M2").shape.conic == pytest.approx(printed["values"][0], rel=1e-8)
+    assert main([*command, "--bounds", "Detector.dz_um=-1:1", "--json"]) == 0
+    assert abs(json.loads(capsys.readouterr().out)["changes"][1]) <= 1e-6
     assert main([*command, "--focal-length", "33.6"]) == 0
     assert "rms of wavefront" in capsys.readouterr().out
 
@@ -63,9 +65,12 @@ def test_optimize_writes_a_prescription(tmp_path, capsys):
     [
         (["sensitivity", "paul_baker", "--parameters", "M9.dz"], "M9"),
         (["sensitivity", "paul_baker", "--out", "matrix.txt"], ".fits or .ecsv"),
+        (["sensitivity", "paul_baker", "--parameters", ","], "such as M2.dx,M1.radius"),
         (["optimize", "paul_baker", "--variables", "M2.rz"], "M2.rz has no effect"),
         (["optimize", "paul_baker", "--variables", "M2.dz", "--merit", "speed"], "speed"),
         (["optimize", "paul_baker", "--variables", "M2.dz", "--bounds", "M2.dz"], "ADDRESS=LOW:HIGH"),
+        (["optimize", "paul_baker", "--variables", "M2.radius", "--bounds", "M2.radius=50:60"], "(50, 60) m: expected"),
+        (["optimize", "paul_baker", "--variables", "M2.dz", "--bounds", "M2.dz_deg=0:1"], "M2.dz is in m, not in deg"),
     ],
 )
 def test_bad_input_is_one_line(command, words, capsys):

@@ -67,7 +67,7 @@ def sweep_summary(changes, ranks=None, failed=0, span=(0.0, 1.0)):
         ),
         (
             sweep_summary({"a": 0.5}, failed=2),
-            "a is the one parameter of fwhm_arcsec, which it changes by up to +0.5 arcsec. 2 of 14 points could not be "
+            "a is the one parameter of fwhm_arcsec, which it changes by up to +0.5 arcsec. 2 of 12 points could not be "
             "computed.",
         ),
         (

@@ -29,12 +29,7 @@ def conic(curvature: float, constant: float = 0.0) -> Shape:
 def even_asphere(curvature: float, constant: float, powers: Sequence[float]) -> Shape:
     """Return a conic with coefficients [m] of r^2, r^4, r^6...; a term in r^2 becomes a part of its own."""
     square, higher = (powers[0] if powers else 0.0), trimmed(powers[1:])
-    if not higher:
-        base = conic(curvature, constant)
-    elif curvature == 0:
-        base = XYPolynomial(_flat_terms(higher))
-    else:
-        base = EvenAsphere(1.0 / curvature, constant, higher)
+    base = EvenAsphere(radius_of(curvature), constant, higher) if higher else conic(curvature, constant)
     return total(base, XYPolynomial(((2, 0, square), (0, 2, square)))) if square else base
 
 
@@ -83,16 +78,6 @@ def trimmed(values: Sequence[float]) -> tuple[float, ...]:
     """Return values without the zeros at their end."""
     count = next((i for i in range(len(values), 0, -1) if values[i - 1] != 0), 0)
     return tuple(values[:count])
-
-
-def _flat_terms(coefficients: tuple[float, ...]) -> tuple[tuple[int, int, float], ...]:
-    """Return a sum of even powers of r, from r^4, as a polynomial of x and y: (x^2 + y^2)^n by the binomial theorem."""
-    return tuple(
-        (2 * i, 2 * (n - i), a * math.comb(n, i))
-        for n, a in enumerate(coefficients, start=2)
-        if a
-        for i in range(n + 1)
-    )
 
 
 def polynomial_powers(count: int) -> list[tuple[int, int]]:

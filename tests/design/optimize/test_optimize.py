@@ -1,6 +1,7 @@
 """Optimisation: exact derivatives of merits, a misaligned LSST recovered, the Paul-Baker found again from spheres."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from pachon.core.errors import ConfigError, DomainError, UnknownNameError
 from pachon.design.optimize.jacobian import ParameterColumns
 from pachon.design.optimize.merit import Beams, SpotMerit, WavefrontMerit
 from pachon.design.optimize.optimize import optimize, wavefronts
+from pachon.design.optimize.problem import DesignProblem
+from pachon.design.optimize.solver import LeastSquares
 from pachon.design.optimize.targets import FocalLength, ImageScale, Target
 from pachon.models.first_order import first_order
 from pachon.models.parameters.parameters import apply, parse_parameters
@@ -237,3 +240,28 @@ def test_summary_and_picture(paul_baker):
     assert summary["variables"] == ["Detector.dz", "M2.dx"]
     assert summary["rms_end_m"] <= summary["rms_start_m"]
     assert found.plot().get_axes()
+
+
+class BrokenProblem(DesignProblem):
+    """Residual x - 1, a hundredth of it beyond 1, with half of the slope; no derivatives beyond `last`."""
+
+    def __init__(self, last):
+        super().__init__((), [SimpleNamespace(address="S1.conic")])
+        self.last = last
+
+    def residuals(self, changes):
+        return np.where(changes < 1.0, 1.0, 0.01) * (changes - 1.0)
+
+    def linear(self, changes):
+        return self.residuals(changes), np.full((1, 1), 0.5 if changes[0] <= self.last else np.nan)
+
+    def stated_rms(self, residuals):
+        return float(np.linalg.norm(residuals))
+
+
+def test_a_step_to_where_derivatives_end_is_made_shorter():
+    """The first step would lead to 2, as a conic may lead to the equator of a surface."""
+    box, start, effect = (np.array([-np.inf]), np.array([np.inf])), np.zeros(1), np.ones(1)
+    assert LeastSquares().resume(BrokenProblem(1.5), box, start, effect) == pytest.approx([1.0])
+    with pytest.raises(DomainError, match=r"no derivatives on the way of S1.conic: expected bounds"):
+        LeastSquares().resume(BrokenProblem(-1.0), box, start, effect)

@@ -264,6 +264,7 @@ def test_missing_and_unreadable_files_are_one_line(tmp_path):
         ("silica: {B", "vacuum: {B", "media.vacuum = "),
         ("default: 0.624", "default: 6.24", "default_wavelength = 6.24e-06: expected within the wavelength range"),
         ("range: [0.3, 1.2]", "range: [1.2, 0.3]", "wavelength_range"),
+        ("{radius: 1.75, limit: 2.5}", "{radius: 1.75, limit: 1.5}", "field_radius = 1.75 deg: expected at most the f"),
         ("surfaces:\n", "surfaces: 3\nspare:\n", "unknown key spare"),
         ("camera: lsst", "camera: lsst\ncamera: lsst", "line 20: not valid YAML: key 'camera' occurs twice"),
         ("camera: lsst", "camera: [lsst", "not valid YAML"),

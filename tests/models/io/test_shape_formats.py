@@ -1,4 +1,4 @@
-"""Shapes written as lens files and read again: Qbfs aspheres, toroids with powers, Fringe sags."""
+"""Shapes written as lens files and read again: Qbfs and flat aspheres, toroids with powers, Fringe sags."""
 
 import json
 import warnings
@@ -14,6 +14,8 @@ from pachon.models.telescope import VACUUM
 SHAPES = {
     "toroid": pachon.models.Toroid(0.3, -0.2, 0.4, (0.2, -30.0, 100.0)),
     "qbfs": pachon.models.QbfsAsphere(0.2, 0.0, 0.02, (2e-5, -1e-5, 0.0, 3e-6)),
+    # A Schmidt plate keeps its coefficients, which an optimisation varies by their names.
+    "flat asphere": pachon.models.EvenAsphere(np.inf, 0.0, (0.2, -30.0, 400.0)),
     "flat qbfs": pachon.models.QbfsAsphere(np.inf, 0.0, 0.02, (2e-5, -1e-5)),
 }
 
@@ -39,7 +41,10 @@ def landing(telescope):
     return telescope.surfaces[-1].to_local(end.position)
 
 
-@pytest.mark.parametrize(("name", "ending"), [*((name, "zmx") for name in SHAPES), ("toroid", "json")])
+@pytest.mark.parametrize(
+    ("name", "ending"),
+    [*((name, "zmx") for name in SHAPES), ("toroid", "json"), *(("flat asphere", e) for e in ("seq", "json", "roa"))],
+)
 def test_written_and_read_again(name, ending, tmp_path):
     telescope, path = singlet(SHAPES[name]), tmp_path / f"lens.{ending}"
     with warnings.catch_warnings():

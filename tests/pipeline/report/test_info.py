@@ -10,7 +10,7 @@ import pachon
 from pachon.models.first_order import first_order
 from pachon.models.io.bundled import BUNDLED
 from pachon.models.io.prescription import load_telescope
-from pachon.pipeline.report.info import FIRST_ORDER_KEYS, describe, figure_rows, surface_rows
+from pachon.pipeline.report.info import FIRST_ORDER_KEYS, coefficient_lines, describe, figure_rows, surface_rows
 
 
 @pytest.mark.parametrize("name", BUNDLED)
@@ -80,4 +80,21 @@ def test_what_follows_other_values_is_shown():
         "S6 glass: that of S1",
         "S7 thickness: marginal height 0 mm",
         "S3 thickness: edge thickness 1 mm at 4 mm",
+    ]
+
+
+def test_terms_of_every_shape_are_shown():
+    """Terms of shapes beside conics and even aspheres are named as in optimisations, lengths in the file's unit."""
+    lens = load_telescope(Path(__file__).parents[2] / "data" / "zmx" / "lens1.zmx")
+    odd = pachon.models.OddAsphere(0.05, -1.5, (0.0, 0.0, -2.0, 0.0, 3e4))
+    bent = pachon.Conic(0.1, 0.5), pachon.models.XYPolynomial(((1, 2, 7.0),))
+    shapes = {lens.surface_names[0]: odd, lens.surface_names[1]: pachon.models.Sum(bent)}
+    for name, shape in shapes.items():
+        lens = lens.with_shape(name, shape)
+    description = describe(lens)
+    json.dumps(description)
+    # A coefficient of r^3 is in 1/mm^2 = 1e6/m^2, of r^5 in 1/mm^4.
+    assert coefficient_lines(description)[:2] == [
+        f"{lens.surface_names[0]}: radius 50, conic -1.5, a3 -2e-06, a5 3e-08",
+        f"{lens.surface_names[1]}: radius 100, conic 0.5, x1y2 7e-06",
     ]

@@ -7,7 +7,9 @@ import pachon
 from pachon.core.errors import PachonError
 from pachon.models.paraxial import following_pupil
 from pachon.studies.metrics.telescope import TELESCOPE_METRICS, TelescopeScene
+from pachon.studies.sweep.analysis import summary, verdict
 from pachon.studies.sweep.file import read_sweep
+from pachon.studies.sweep.store import SweepStore
 from pachon.studies.sweep.sweep import run_sweep
 
 LENS = "tests/data/zmx/lens1.zmx"
@@ -96,6 +98,7 @@ def test_metrics_of_images():
         ({"parameters": {"S99.dy_um": {"nominal": 0, "values": [0, 1]}}}, "S99"),
         ({"parameters": {"atmosphere.r0_m": {"nominal": 0, "values": [0, 1]}}}, "atmosphere"),
         ({"compensators": ["Image.dz"]}, r"compensators.Image.dz.*unit"),
+        ({"fields_deg": [[0, 0], [0, 95]]}, r"field = \(0, 95\) deg: expected within"),
         ({"base": {"telescope": "lsst_v3.3_r"}, "metrics": ["fwhm"]}, "fields_deg.*without a camera"),
     ],
 )
@@ -108,3 +111,13 @@ def test_bad_input(tmp_path, changes, words):
 def test_a_compensator_without_effect_is_a_problem_of_the_point(tmp_path):
     table = table_of(tmp_path, metrics=["spots"], compensators=["Image.dx_um"])
     assert all("Image.dx has no effect" in problem for problem in table.problem)
+
+
+def test_points_that_fail_are_among_those_that_are_counted(tmp_path):
+    """At 5 m beside the axis no light meets the surface."""
+    table = table_of(tmp_path, parameters={"S3.dy_um": {"nominal": 0, "values": [5e6]}}, metrics=["spots"])
+    assert [bool(problem) for problem in table.problem] == [False, True]
+    with SweepStore(tmp_path / "lens.sweep") as store:
+        told = summary(table, store.sweep)
+    assert (told["points"], told["failed"]) == (2, 1)
+    assert "1 of 2 points could not be computed." in verdict(told)

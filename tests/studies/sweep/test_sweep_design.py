@@ -101,6 +101,7 @@ def test_tables_with_a_gap_are_refused(tmp_path):
         ("parameters: {a: {range: [1, 3]}}", r"parameters\.a\.nominal is missing"),
         ("parameters: {a: {normal: [1, 0], nominal: 1}}", "expected a standard deviation above 0"),
         ("parameters: {a: {nominal: 1, range: [1, .inf]}}", r"range\[1\] = Infinity: expected a finite number"),
+        ("parameters: {a: {nominal: 1, values: [.nan]}}", r"values\[0\] = NaN: expected a finite number, a text"),
         ("{}", r"parameters = \{\}: expected at least one parameter"),
         ("design: {kind: table}", r"design\.file is missing"),
         ("design: {kind: sobble}", "expected one of one_at_a_time, grid, monte_carlo, latin_hypercube, sobol, table"),

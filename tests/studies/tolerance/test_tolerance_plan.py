@@ -180,6 +180,8 @@ def test_named_degrees_of_freedom(lsst_r):
             UnknownNameError,
             "compensators.*X",
         ),
+        ({"tolerances": [{"name": "L2.decentre", "size": 5}]}, ConfigError, "unit at the end, such as L2.decentre_um"),
+        ({"tolerances": [{"name": "L2.tilt_mm", "size": 5}]}, ConfigError, "unit at the end, such as L2.tilt_arcmin"),
     ],
 )
 def test_wrong_tolerances(triplet, content, error, words):

@@ -137,7 +137,7 @@ def test_processes_give_the_same_bytes(triplet, study, tmp_path):
     found = run_tolerances(
         triplet, file_of(), tmp_path / "points", execution=Execution(workers=lambda c: process_workers(c, 2))
     )
-    for name in ("lower", "upper", "inverse", "draws", "moves"):
+    for name in ("lower", "upper", "inverse", "deviations", "merit", "moves"):
         assert getattr(found, name).tobytes() == getattr(study, name).tobytes()
 
 
