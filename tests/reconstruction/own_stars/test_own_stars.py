@@ -90,6 +90,22 @@ def test_residuals_of_held_out_stars_are_their_noise(own):
         replace(own, positions=1e-60 * own.positions).rho_statistics()
 
 
+def test_g_of_the_table_is_that_of_hsm(own):
+    """The weighted e is about half of it: a user who measures the stamps elsewhere must find the table's numbers."""
+    galsim = pytest.importorskip("galsim")
+    table = own.table()
+    used = np.flatnonzero(own.used)
+    for images, start in ((own.stamps, ""), (own.predicted, "held_out_")):
+        for row, image in zip(used[::9], images[::9], strict=True):
+            moments = galsim.hsm.FindAdaptiveMom(galsim.Image(image))
+            expected = [moments.observed_shape.g1, moments.observed_shape.g2, moments.moments_sigma * 0.2]
+            # Both iterate until steps are below 1e-6.
+            assert [table[start + name][row] for name in ("g1", "g2", "sigma")] == pytest.approx(expected, abs=2e-6)
+    assert np.isnan(table["g1"][5])
+    residual = np.stack([table[f"g{i}"] - table[f"held_out_g{i}"] for i in (1, 2)])[:, used]
+    assert own.summary()["rms_g_held_out"] == pytest.approx(np.sqrt((residual**2).mean()))
+
+
 @pytest.mark.long
 def test_the_parts_held_out_are_those_of_the_seed(stars, own):
     options = {"basis": "pixels", "interpolation": "polynomial", "order": 1, "weights": "noise"}
