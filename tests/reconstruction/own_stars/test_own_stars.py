@@ -78,6 +78,21 @@ def test_the_model_is_that_of_the_truth_between_the_stars(own):
     assert np.sqrt(np.mean((made.size / true.size - 1.0) ** 2)) < 0.006
 
 
+def test_a_neighbour_cut_by_the_edge_of_a_stamp_leaves_the_star_as_it_is(stars, own):
+    """Its sharp edge would ring along whole rows when the star is centred."""
+    yy, xx = np.indices((SIZE, SIZE))
+    stamps = stars.stamps.copy()
+    stamps[20] += 5000.0 * np.exp(-((xx - SIZE) ** 2 + (yy - 19.0) ** 2) / (2.0 * 2.0**2))
+    found = fit_own_stars(stamps, stars.positions, PIXEL)
+    assert found.flags[20] & StarFlag.NEIGHBOUR
+    assert found.used[20]
+    number = int(np.flatnonzero(found.used).searchsorted(20))
+    rim = np.s_[:, :-12]  # free of the neighbour
+    difference = found.stamps[number][rim] - own.stamps[int(np.flatnonzero(own.used).searchsorted(20))][rim]
+    # Below the noise of a pixel, and a tenth of the ringing.
+    assert np.sqrt(np.mean(difference**2)) < 0.5 * SKY / own.electrons[number]
+
+
 def test_residuals_of_held_out_stars_are_their_noise(own):
     d1, d2, size = own.residuals()
     assert 0.8 < np.std(np.concatenate([d1, d2]) / np.tile(own.sigma_e, 2)) < 1.35
