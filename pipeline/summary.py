@@ -215,11 +215,10 @@ def size_scatter(products: Sequence[CcdStars]) -> float:
 
 
 def _rms_within_ccds(values: Sequence[np.ndarray], deviations: Callable[[np.ndarray], np.ndarray]) -> float:
-    """Return the rms of the deviations of the finite values [k, n] of each CCD."""
+    """Return the rms of the deviations of the finite values [k, n] of each CCD; one value alone has none."""
     finite = [v[:, np.isfinite(v).all(axis=0)] for v in values]
-    if not any(v.size for v in finite):
-        return np.nan
-    return rms(np.concatenate([deviations(v) for v in finite if v.size], axis=1))
+    of_ccds = [deviations(v) for v in finite if v.shape[1] > 1]
+    return rms(np.concatenate(of_ccds, axis=1)) if of_ccds else np.nan
 
 
 def _median_distortion(products: Sequence[CcdProduct]) -> float:

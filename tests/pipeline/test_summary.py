@@ -1,10 +1,12 @@
 """Metrics of a run: the ranges of separation of its mean correlations."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pachon.measure.correlation import Correlation, shear_correlation
-from pachon.pipeline.summary import bins_up_to, run_metrics
+from pachon.pipeline.summary import bins_up_to, run_metrics, scatter, size_scatter
 from pachon.reconstruction.ccd_product import read_product
 
 ARCMIN = np.deg2rad(1 / 60)
@@ -24,6 +26,17 @@ def test_long_separations_are_those_from_10_to_180_arcmin(finished_run):
     assert metrics["xi_plus_truth_short"] == pytest.approx((4.0 + 3 * 8.0) / 4)
     assert metrics["xi_plus_truth_long"] == pytest.approx(1.5)
     assert np.isnan(metrics["error_xi_plus_truth_long"])
+
+
+def test_one_measured_psf_of_a_ccd_has_no_scatter(finished_run):
+    """As of images narrower than a pixel, of which adaptive moments measure few: not a scatter of zero."""
+    product = read_product(finished_run / "ccd_R22_S11.fits")
+    missing = np.full_like(product.holdout.g1, np.nan)
+    missing[0] = product.holdout.g1[0]
+    one = replace(product, holdout=replace(product.holdout, g1=missing))
+    assert np.isnan(scatter([one], "g"))
+    assert np.isnan(size_scatter([one]))
+    assert scatter([one, product], "g") == scatter([product], "g")
 
 
 def test_no_pairs_within_a_range_give_no_mean():
