@@ -56,7 +56,10 @@ def model_command(
     size: Annotated[int | None, Option(help="Side of the PSF [pixel], odd; that of the stamps less a rim.")] = None,
     min_snr: MinSnr = 20.0,
     gain: Gain = 1.0,
-    saturation: Annotated[float | None, Option(help="Level from which on a pixel is saturated.")] = None,
+    saturation: Annotated[
+        float | None,
+        Option(help="Level from which on a pixel is saturated; by default one at which 3 pixels of a star are equal."),
+    ] = None,
     background: Annotated[bool, Option(help="Subtract the median of the outer pixels of each stamp.")] = True,
     recipe: Recipe = None,
     basis: Basis = None,

@@ -11,6 +11,7 @@ from astropy.table import Table
 from pachon import PsfModel
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError
+from pachon.measure.pixel_masks import clipped_stars
 from pachon.measure.shapes import measure_shapes
 from pachon.measure.star_selection import StarFlag
 from pachon.reconstruction.own_stars.own_stars import fit_own_stars
@@ -91,6 +92,19 @@ def test_a_neighbour_cut_by_the_edge_of_a_stamp_leaves_the_star_as_it_is(stars, 
     difference = found.stamps[number][rim] - own.stamps[int(np.flatnonzero(own.used).searchsorted(20))][rim]
     # Below the noise of a pixel, and a tenth of the ringing.
     assert np.sqrt(np.mean(difference**2)) < 0.5 * SKY / own.electrons[number]
+
+
+def test_clipped_stars_are_left_out_without_a_level_of_saturation(stars, own):
+    """Where three pixels of a star have exactly its greatest value; those with fewer of that value are clipped too."""
+    level = np.sort(stars.stamps.max(axis=(1, 2)))[-6]
+    clipped = (stars.stamps >= level).any(axis=(1, 2))
+    found = fit_own_stars(np.minimum(stars.stamps, level), stars.positions, PIXEL)
+    assert ((found.flags & StarFlag.SATURATED) > 0).tolist() == clipped.tolist()
+    assert not found.used[clipped].any()
+    # Not where a level is given, nor in images without noise, whose stars may have equal pixels about a corner.
+    unclipped = fit_own_stars(np.minimum(stars.stamps, level), stars.positions, PIXEL, saturation=10.0 * level)
+    assert ((unclipped.flags & StarFlag.SATURATED) > 0).sum() < clipped.sum()
+    assert not clipped_stars(np.ones((5, 9, 9)), np.zeros((5, 9, 9), dtype=bool)).any()
 
 
 def test_residuals_of_held_out_stars_are_their_noise(own):
