@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -55,7 +56,10 @@ def model_command(
     size: Annotated[int | None, Option(help="Side of the PSF [pixel], odd; that of the stamps less a rim.")] = None,
     min_snr: MinSnr = 20.0,
     gain: Gain = 1.0,
-    saturation: Annotated[float | None, Option(help="Level from which on a pixel is saturated.")] = None,
+    saturation: Annotated[
+        float | None,
+        Option(help="Level from which on a pixel is saturated; by default one at which 3 pixels of a star are equal."),
+    ] = None,
     background: Annotated[bool, Option(help="Subtract the median of the outer pixels of each stamp.")] = True,
     recipe: Recipe = None,
     basis: Basis = None,
@@ -127,17 +131,19 @@ def model_command(
         print_json({"model": str(path), **summary_of_stars})
     elif not quiet:
         flagged = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in summary_of_stars["flagged"].items() if n)
+        percent = partial(_percent, summary_of_stars)
         rows = [
             ("kind of model", str(summary_of_stars["kind"])),
             ("stars, used", f"{summary_of_stars['stars']}, {summary_of_stars['used']}"),
             ("defects, masked or left out", flagged or "none"),
             ("S/N, median", f"{summary_of_stars['median_snr']:.0f}"),
             (f"FWHM, pixels of {pixel_arcsec:.4g} arcsec", f"{summary_of_stars['fwhm_arcsec']:.3g} arcsec"),
-            ("rms of e of the stars", f"{100 * summary_of_stars['rms_e']:.2f} %"),
-            ("... less the model, held out", f"{100 * summary_of_stars['rms_e_held_out']:.2f} %"),
-            ("... of which noise of the stars", f"{100 * summary_of_stars['rms_e_noise']:.2f} %"),
-            ("rms of size less the model, held out", f"{100 * summary_of_stars['rms_size_held_out']:.2f} %"),
-            ("... of which noise of the stars", f"{100 * summary_of_stars['rms_size_noise']:.2f} %"),
+            ("rms of g, weighted e of the stars", percent("rms_g", "rms_e")),
+            ("... less the model, held out", percent("rms_g_held_out", "rms_e_held_out")),
+            ("... of which noise of the stars, in weighted e", percent("rms_e_noise")),
+            ("rms dT/T, held out", percent("rms_dt_g_held_out")),
+            ("rms of weighted size less the model, held out", percent("rms_size_held_out")),
+            ("... of which noise of the stars", percent("rms_size_noise")),
             ("model", str(path)),
             *([] if no_picture else [("picture", str(picture_path))]),
             ("stars", str(table or path.with_suffix(".ecsv"))),
@@ -145,6 +151,11 @@ def model_command(
         if colour_column is not None:
             rows.insert(1, ("dependence on colour", _colour_text(colour_column, result.model.colour)))
         Rows(("", ""), rows, left=2, verdict=model_verdict(summary_of_stars)).show()
+
+
+def _percent(figures: dict[str, Any], *keys: str) -> str:
+    """Return some figures in per cent."""
+    return ", ".join(f"{100 * figures[key]:.2f} %" for key in keys)
 
 
 def _colour_text(column: str, colour: FittedColour | None) -> str:

@@ -84,8 +84,8 @@ def model_verdict(figures: Figures) -> str:
         return f"The PSF model is fitted to {of_stars}, too few to hold any out: its error is unknown."
     noise_text = f", of which {percent_text(noise)} is noise of the stars" if math.isfinite(noise) else ""
     return (
-        f"The PSF model is fitted to {of_stars}; held out, it differs from them by {percent_text(error)} rms in e"
-        f"{noise_text}."
+        f"The PSF model is fitted to {of_stars}; held out, it differs from them by {percent_text(error)} rms "
+        f"in weighted e{noise_text}."
     )
 
 

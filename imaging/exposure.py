@@ -102,7 +102,7 @@ class Exposure:
         if self.sky is not None and not abs(self.sky) < _MOST_MAGNITUDES:
             limits = f"{-_MOST_MAGNITUDES:g} to {_MOST_MAGNITUDES:g}"
             raise DomainError(f"sky = {self.sky}: expected a finite brightness in AB mag/arcsec^2, {limits}")
-        if self.background >= self.exposures * self.full_well:
+        if self.background >= self.well:
             raise DomainError(
                 f"sky = {self._brightness:.2f}: its {self.background / self.exposures:.0f} electrons a pixel fill the "
                 f"full well of {self.full_well:g}; expected a fainter sky or a shorter exposure"
@@ -123,6 +123,21 @@ class Exposure:
         """Expected electrons of sky and dark current in a pixel."""
         sky = sky_electrons_per_pixel(self._band, self.total_time, self.pixel_scale, sky=self.sky)
         return sky + self.dark_current * self.total_time
+
+    @property
+    def well(self) -> float:
+        """Electrons at which a pixel saturates in all exposures together."""
+        return self.exposures * self.full_well
+
+    @property
+    def subtracted(self) -> float:
+        """Electrons that are subtracted from each pixel."""
+        return self.background if self.subtract_background else 0.0
+
+    @property
+    def saturation_level(self) -> float:
+        """Value of saturated pixels [ADU], to the last bit."""
+        return float(np.float32((self.well - self.subtracted) / self.gain))
 
     @property
     def noise_rms(self) -> float:
@@ -175,9 +190,8 @@ def expose(
     """
     image, variance = np.empty(scene.shape, dtype=np.float32), np.empty(scene.shape, dtype=np.float32)
     mask = np.zeros(scene.shape, dtype=np.int16)
-    well, gain = exposure.exposures * exposure.full_well, exposure.gain
+    well, gain = exposure.well, exposure.gain
     read = exposure.exposures * exposure.read_noise**2
-    level = exposure.background if exposure.subtract_background else 0.0
 
     def fill(band: int) -> None:
         rows = slice(band * _ROWS, (band + 1) * _ROWS)
@@ -188,7 +202,7 @@ def expose(
             collected = random.poisson(np.maximum(collected, 0.0)).astype(np.float64)
             collected += random.normal(0.0, np.sqrt(read), collected.shape)
         mask[rows][collected >= well] |= SATURATED
-        image[rows] = (np.minimum(collected, well) - level) / gain
+        image[rows] = (np.minimum(collected, well) - exposure.subtracted) / gain
 
     with ThreadPoolExecutor(thread_count(threads)) as pool:
         list(pool.map(fill, range(-(-scene.shape[0] // _ROWS))))

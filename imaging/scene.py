@@ -70,7 +70,7 @@ class CcdScene:
             ("SKY", round(settings.background / settings.gain, 6), "[adu] background: sky and dark current"),
             ("SKYSUB", settings.subtract_background, "whether the background is subtracted"),
             ("RDNOISE", settings.read_noise, "[electron] rms of one exposure"),
-            ("SATURATE", settings.exposures * settings.full_well, "[electron] full well, all exposures"),
+            ("SATURATE", settings.saturation_level, "[adu] value of saturated pixels"),
             ("NOISE", settings.noise, "whether there is noise"),
             ("SEED", self.seed, "seed of all random numbers"),
             ("EPOCH", self.epoch, "number of the visit"),

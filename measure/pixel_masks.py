@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from ..core.errors import DomainError
@@ -18,6 +19,8 @@ from ..core.units import real_array
 _MASKED = -1e29
 # Fewest columns side by side that are copies of each other: two may be alike in a symmetric star without noise.
 _COPIES = 3
+#: Pixels of exactly the greatest value of a star that make it clipped.
+_FLAT = 3
 # Fewest rows of theirs: of whole numbers with a noise of 1 so many agree by chance once in ten thousand stamps.
 _COPIED_LENGTH = 12
 # Standard deviation of the weights of good neighbours [pixel], about the width of a star.
@@ -64,6 +67,22 @@ def weightless_pixels(images: np.ndarray, weights: Any = None) -> np.ndarray:
     if weightless.size and weightless.all():
         raise DomainError("weights are zero in every pixel: expected positive ones where the stars are")
     return bad | weightless
+
+
+def clipped_stars(images: np.ndarray, bad: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the stars whose greatest value is a level of saturation, bool [n].
+
+    Saturated pixels are clipped at one level, which noise does not repeat: three or more pixels of a stamp have exactly
+    its greatest value, and that is more than half of the greatest of all stamps. Stars that reach such a level in fewer
+    pixels are clipped, too. Where most stars seem so, they are images without noise.
+    """
+    values = np.where(bad, -np.inf, images)
+    greatest = values.max(axis=(1, 2), initial=-np.inf)
+    equal = (values == greatest[:, None, None]).sum(axis=(1, 2))
+    flat = (equal >= _FLAT) & np.isfinite(greatest) & (greatest > 0.5 * greatest.max(initial=-np.inf))
+    if 2 * flat.sum() > len(flat):
+        return np.zeros(len(flat), dtype=bool)
+    return np.isin(greatest, greatest[flat])
 
 
 def copied_pixels(images: np.ndarray) -> np.ndarray:

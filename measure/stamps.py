@@ -182,13 +182,15 @@ def center_masks(masks: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> 
 def decenter_masks(masks: np.ndarray, x: np.ndarray, y: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Return masks of centred stamps [n, size, size] on the images of a shape (ny, nx) they were cut from.
 
-    The inverse of :func:`center_masks`: bool [n, ny, nx], False beyond the stamps.
+    The inverse of :func:`center_masks`: bool [n, ny, nx]. Beyond the stamps masks are those at their edge: a neighbour
+    whose peak is there would ring through the whole stamp when it is shifted.
     """
-    rows, columns = _middle_pixels(masks.shape[1], shape)
+    middle = _middle_pixels(masks.shape[1], shape)
     shifts = np.nan_to_num(np.stack([x, y], axis=1)) - np.array([n // 2 - (n - 1) / 2.0 for n in shape[::-1]])
-    result = np.zeros((len(masks), *shape), dtype=bool)
-    result[:, rows, columns] = masks
-    return shift_masks(result, *shifts.T)
+    reach = int(np.ceil(np.abs(shifts).max(initial=0.0))) + 1  # from beyond the images
+    rims = [(reach + lines.start, reach + count - lines.stop) for lines, count in zip(middle, shape, strict=True)]
+    moved = shift_masks(np.pad(masks, [(0, 0), *rims], mode="edge"), *shifts.T)
+    return moved[:, reach:-reach, reach:-reach]
 
 
 def shift_masks(masks: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:

@@ -40,7 +40,7 @@ from ..wavefront.psf.engines import ENGINES
 from .config import Configuration, digest
 from .config_hash import hashed_content
 from .defaults import resolve
-from .photometry import band_of
+from .photometry import band_of, lit_fraction_on_axis
 from .resolved_values import resolved_value
 from .sensor.displacement import Displacement, EdgeRolloff, TreeRings
 from .simulate.screen_cover import check_samples, corner_fields
@@ -126,6 +126,11 @@ class Experiment:
     def band(self) -> Band:
         """Zero point, sky and noise of the camera in the band."""
         return band_of(resolved_value(self.config.band), self.config.photometry)
+
+    @cached_property
+    def lit_fraction_on_axis(self) -> float:
+        """Part of the entrance pupil that is lit on the axis, where the zero point is measured."""
+        return lit_fraction_on_axis(self.telescope, float(self.wavelengths[len(self.wavelengths) // 2]))
 
     @property
     def wavelengths(self) -> np.ndarray:

@@ -17,9 +17,11 @@ from ..reconstruction.ccd_product import CCD_KINDS, CcdProduct, CcdStars, Stars
 CORRELATED = ("truth", "observed", "residual", "away")
 #: Shape parameters of which a focal-plane model predicts its uncertainty.
 _PREDICTED = ("e1", "e2", "size")
-#: Smallest separation of pairs [arcmin].
-SHORTEST_ARCMIN = 0.5
-_BINS_PER_DECADE = 6
+#: Ends of the long separations [arcmin], which are edges of bins: none has pairs on both sides of one.
+_LONG_FROM, _LONG_TO = SEPARATION_RANGES["long"]
+#: Smallest separation of pairs [arcmin], 0.56.
+SHORTEST_ARCMIN = _LONG_FROM**2 / _LONG_TO
+_BINS_PER_RANGE = 8
 _FEWEST_BINS = 4
 
 
@@ -84,11 +86,12 @@ def separation_bins(products: Sequence[CcdStars]) -> SeparationBins:
 
 
 def bins_up_to(longest: float, exact: bool | None = None) -> SeparationBins:
-    """Return bins of separation from :data:`SHORTEST_ARCMIN` to the longest separation [rad], six a decade."""
+    """Return bins of separation from :data:`SHORTEST_ARCMIN` to beyond the longest separation [rad], 6.4 a decade."""
     shortest = SHORTEST_ARCMIN * ARCMIN
-    longest = max(longest, 2.0 * shortest)
-    bins = max(_FEWEST_BINS, round(_BINS_PER_DECADE * np.log10(longest / shortest)))
-    return SeparationBins(shortest, longest, bins, exact)
+    width = np.log(_LONG_TO / _LONG_FROM) / _BINS_PER_RANGE
+    # A longest separation at an edge is not to round beyond it.
+    bins = max(_FEWEST_BINS, int(np.ceil(np.log(max(longest, shortest) / shortest) / width - 1e-9)))
+    return SeparationBins(shortest, shortest * float(np.exp(width * bins)), bins, exact)
 
 
 def ccd_metrics(product: CcdProduct) -> dict[str, Any]:
@@ -212,11 +215,10 @@ def size_scatter(products: Sequence[CcdStars]) -> float:
 
 
 def _rms_within_ccds(values: Sequence[np.ndarray], deviations: Callable[[np.ndarray], np.ndarray]) -> float:
-    """Return the rms of the deviations of the finite values [k, n] of each CCD."""
+    """Return the rms of the deviations of the finite values [k, n] of each CCD; one value alone has none."""
     finite = [v[:, np.isfinite(v).all(axis=0)] for v in values]
-    if not any(v.size for v in finite):
-        return np.nan
-    return rms(np.concatenate([deviations(v) for v in finite if v.size], axis=1))
+    of_ccds = [deviations(v) for v in finite if v.shape[1] > 1]
+    return rms(np.concatenate(of_ccds, axis=1)) if of_ccds else np.nan
 
 
 def _median_distortion(products: Sequence[CcdProduct]) -> float:

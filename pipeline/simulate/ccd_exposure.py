@@ -44,7 +44,7 @@ class NoiseFreeStars:
     image: np.ndarray  #: [n, ny, nx], unit sum
     pixel_scale: float  #: angle of a pixel [rad]
     fields: np.ndarray  #: field angles [rad], [n, 2]
-    lit_fraction: np.ndarray  #: part of the entrance pupil whose light arrives, mean over wavelengths, [n]
+    lit_fraction: np.ndarray  #: light that arrives over that on the axis, mean over wavelengths, [n]
     offset: np.ndarray  #: place of the reference point from the centre of the middle pixel [pixel], [n, 2]
 
     def part(self, index: slice) -> NoiseFreeStars:
@@ -304,7 +304,8 @@ def _expose(
     offset = psfs.offset
     if transposed:
         image, offset = np.ascontiguousarray(image.swapaxes(1, 2)), offset[:, ::-1]
-    return NoiseFreeStars(image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1), offset)
+    on_axis = experiment.lit_fraction_on_axis if optical else 1.0
+    return NoiseFreeStars(image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1) / on_axis, offset)
 
 
 def _with_static_displacements(experiment: Experiment, middles: np.ndarray, images: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from ...core.number_text import counted
 from ...core.random_streams import stream
 from ...core.statistics import finite_median, median_image
 from ...core.units import positive_angle, real_array, require_seed
-from ...measure.pixel_masks import fill_symmetric
+from ...measure.pixel_masks import clipped_stars, fill_symmetric
 from ...measure.shapes import fwhm, measure_shapes
 from ...measure.stamps import center_masks, decenter_masks, shift_to_middle
 from ...measure.star_selection import StarFlag, flag_stars, require_stars
@@ -85,7 +85,7 @@ def fit_own_stars(
     gain : float
         Electrons in a unit of the stamps.
     saturation : float, optional
-        Level from which on a pixel is saturated.
+        Level from which on a pixel is saturated; by default one at which three pixels of a star are equal.
     background : bool
         Whether to subtract the median of the outer pixels of each stamp.
     masks : array of bool, optional
@@ -196,7 +196,9 @@ def fit_own_stars(
     filled_stars = fill()
     centred = centre(filled_stars)
     selection = flag_stars(centred, np.where(rms > 0.0, rms, 1.0), gain=gain, saturation=saturation)
-    flags, none_apart = selection.flags, np.zeros(len(images), dtype=bool)
+    clipped = np.zeros(len(images), dtype=bool) if saturation is not None else clipped_stars(raw_images, bad)
+    flags = np.where(clipped, selection.flags | StarFlag.SATURATED, selection.flags)
+    none_apart = np.zeros(len(images), dtype=bool)
     stars = select(filled_stars, flags, none_apart, centred)
     apart = stars.with_defects_apart(selection.masks, weight_sigma(scale, weight))
     if apart.any():

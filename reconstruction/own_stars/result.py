@@ -16,7 +16,9 @@ from ...core.number_text import counted
 from ...core.plotting import BLUE, ORANGE, RED, figure_at, label_log_axis, plain_text, styled
 from ...core.products import Columns, described_table
 from ...core.result import Result
+from ...core.statistics import rms
 from ...core.units import ARCMIN, ARCSEC, require_count
+from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
 from ...measure.correlation import LARGEST_SEPARATION, LEAST_SEPARATION, MOST_BINS, SeparationBins
 from ...measure.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
 from ...measure.rho_statistics import RhoStatistics, rho_statistics
@@ -93,20 +95,30 @@ class OwnStars(Result):
     def table(self) -> Table:
         """Return all stars with their shapes and residuals."""
         star_shapes, model_shapes = self.shapes, self.held_out
+        star_moments, model_moments = self.adaptive
         columns: Columns = {
             "x": (self.positions[:, 0], "", "place, in the unit of the positions"),
             "y": (self.positions[:, 1], "", "place, in the unit of the positions"),
             "snr": (self.snr, "", "signal-to-noise ratio"),
             "flags": (self.flags, "", "bits of StarFlag"),
             "used": (self.used, "", "whether the model is made of it"),
-            "masked": (_of_all(self.masks.sum(axis=(1, 2)), self.used), "", "pixels without weight; -1 if not used"),
-            "e1": (star_shapes.e1, "", "ellipticity along x"),
-            "e2": (star_shapes.e2, "", "ellipticity along the diagonal x = y"),
+            "masked": (self._of_all(self.masks.sum(axis=(1, 2))), "", "pixels without weight; -1 if not used"),
+            "e1": (star_shapes.e1, "", "(a - b)/(a + b) along x, moments under a round weight"),
+            "e2": (star_shapes.e2, "", "the same along the diagonal x = y"),
             "size": (star_shapes.size / ARCSEC, "arcsec", "weighted rms size"),
             "held_out_e1": (model_shapes.e1, "", "e1 of the model made without the star"),
             "held_out_e2": (model_shapes.e2, "", "e2 of the model made without the star"),
             "held_out_size": (model_shapes.size / ARCSEC, "arcsec", "size of the model made without the star"),
         }
+        for name, unit, meaning in (
+            ("g1", "", "(a - b)/(a + b) along x, adaptive moments"),
+            ("g2", "", "the same along the diagonal x = y"),
+            ("sigma", "arcsec", "size sqrt(a b) of adaptive moments"),
+        ):
+            scale = ARCSEC if unit else 1.0
+            columns[name] = (self._of_all(getattr(star_moments, name) / scale), unit, meaning)
+            held_out_values = self._of_all(getattr(model_moments, name) / scale)
+            columns[f"held_out_{name}"] = (held_out_values, unit, f"{name} of the model made without the star")
         return described_table(columns, {})
 
     @cached_property
@@ -119,12 +131,14 @@ class OwnStars(Result):
     @cached_property
     def held_out(self) -> Shapes:
         """Shapes of the model made without the star and others of its part; NaN for stars that are not used."""
-        values = {}
-        for name, value in vars(measure_shapes(self.predicted, self.pixel_scale, self.weight_fwhm)).items():
-            all_stars = np.full(len(self.used), -1 if value.dtype.kind in "iu" else np.nan, dtype=value.dtype)
-            all_stars[self.used] = value
-            values[name] = all_stars
-        return Shapes(**values)
+        values = vars(measure_shapes(self.predicted, self.pixel_scale, self.weight_fwhm))
+        return Shapes(**{name: self._of_all(value) for name, value in values.items()})
+
+    @cached_property
+    def adaptive(self) -> tuple[AdaptiveMoments, AdaptiveMoments]:
+        """Adaptive moments, as GalSim's HSM, of the used stars and of the models made without them."""
+        stars, models = (adaptive_moments(images, self.pixel_scale) for images in (self.stamps, self.predicted))
+        return stars, models
 
     @property
     def sigma_e(self) -> np.ndarray:
@@ -156,6 +170,12 @@ class OwnStars(Result):
             (star_shapes.size / model_shapes.size - 1.0)[used],
         )
 
+    def _of_all(self, values: np.ndarray) -> np.ndarray:
+        """Return values of the used stars as those of all; NaN, or -1 of whole numbers, for the others."""
+        all_stars = np.full(len(self.used), -1 if values.dtype.kind in "iu" else np.nan, dtype=values.dtype)
+        all_stars[self.used] = values
+        return all_stars
+
     def plot(self, title: str = "own stars", *, ax: Axes | Figure | None = None) -> Figure:
         """Draw whiskers, residuals of held-out stars against S/N, rho statistics and stamps."""
         return _draw(self, title, ax)
@@ -178,12 +198,22 @@ class OwnStars(Result):
             "flagged": counts,
             "median_snr": float(np.median(self.snr[self.used])),
             "fwhm_arcsec": float(np.median(fwhm(self.predicted, self.pixel_scale))) / ARCSEC,
-            "rms_e": _rms(self.shapes.e1[self.used], self.shapes.e2[self.used]),
-            "rms_e_held_out": _rms(d1, d2),
-            "rms_e_noise": _rms(self.sigma_e),
-            "rms_size_held_out": _rms(size),
-            "rms_size_noise": _rms(self.sigma_size),
+            "rms_e": rms(np.stack([self.shapes.e1[self.used], self.shapes.e2[self.used]])),
+            "rms_e_held_out": rms(np.stack([d1, d2])),
+            "rms_e_noise": rms(self.sigma_e),
+            "rms_size_held_out": rms(size),
+            "rms_size_noise": rms(self.sigma_size),
+            **self._adaptive_summary(),
             **self._colour_summary(),
+        }
+
+    def _adaptive_summary(self) -> dict[str, float]:
+        """Return rms of g, and of the residuals of g and T, at stars that were held out."""
+        stars, models = self.adaptive
+        return {
+            "rms_g": rms(np.stack([stars.g1, stars.g2])),
+            "rms_g_held_out": rms(np.stack([stars.g1 - models.g1, stars.g2 - models.g2])),
+            "rms_dt_g_held_out": rms((stars.T - models.T) / stars.T),
         }
 
     def _colour_summary(self) -> dict[str, Any]:
@@ -219,17 +249,6 @@ def star_rho_statistics(places: np.ndarray, stars: Shapes, model: Shapes, bins: 
     return rho_statistics(x, y, *star_values, *model_values, bins=separation_bins)
 
 
-def _of_all(counts: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Return counts of the used stars as those of all, -1 for the others."""
-    all_counts = np.full(len(used), -1)
-    all_counts[used] = counts
-    return all_counts
-
-
-def _rms(*values: np.ndarray) -> float:
-    return float(np.sqrt(np.nanmean(np.concatenate(values) ** 2)))
-
-
 def _draw(own: OwnStars, title: str, ax: Axes | Figure | None) -> Figure:
     used = own.used
     d1, d2, size = own.residuals()
@@ -257,7 +276,7 @@ def _draw(own: OwnStars, title: str, ax: Axes | Figure | None) -> Figure:
         rising = np.argsort(snr)
         for column, (label, values, noise) in enumerate(
             (
-                ("e, star - model", np.stack([d1, d2]), own.sigma_e),
+                ("weighted e, star - model", np.stack([d1, d2]), own.sigma_e),
                 ("size, (star - model)/model", size[None], own.sigma_size),
             )
         ):
@@ -290,7 +309,7 @@ def _draw(own: OwnStars, title: str, ax: Axes | Figure | None) -> Figure:
         figure.suptitle(
             f"{plain_text(title)}: {metrics['used']} of {counted(metrics['stars'], 'star')}, "
             f"FWHM {metrics['fwhm_arcsec']:.3g} arcsec; "
-            f"rms of e held out {100 * metrics['rms_e_held_out']:.2g} %, "
+            f"rms of weighted e held out {100 * metrics['rms_e_held_out']:.2g} %, "
             f"noise of the stars {100 * metrics['rms_e_noise']:.2g} %",
             fontsize=10,
         )

@@ -88,7 +88,10 @@ def snr_weights(kind: str, snr: np.ndarray) -> np.ndarray | None:
 def as_extent(extent: Any, positions: np.ndarray) -> Extent:
     """Return the given extent, or that of the positions, as four floats."""
     if extent is None:
-        (xmin, ymin), (xmax, ymax) = positions.min(axis=0), positions.max(axis=0)
+        (xmin, ymin), (xmax, ymax) = positions.min(axis=0).tolist(), positions.max(axis=0).tolist()
+        if xmin == xmax or ymin == ymax:
+            name, place = ("x", xmin) if xmin == xmax else ("y", ymin)
+            raise DomainError(f"positions: all stars are at {name} = {place:g}; expected stars all over the image")
     else:
         try:
             xmin, xmax, ymin, ymax = (float(v) for v in extent)

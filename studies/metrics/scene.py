@@ -12,15 +12,14 @@ from pydantic import Field
 
 from ...core.errors import ConfigError, DomainError, unknown_name
 from ...core.schema import Positive, Real, Section
-from ...core.units import ARCMIN
 from ...design.metrics.distortion import Distortion, distortion
 from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
-from ...measure.correlation import Correlation, SeparationBins, shear_correlation
+from ...measure.correlation import Correlation, shear_correlation
 from ...measure.shapes import Shapes, measure_shapes
 from ...models.telescope import Telescope
 from ...pipeline.experiment import Experiment
 from ...pipeline.simulate.ccd_exposure import NoiseFreeStars, expose_positions, holdout_positions
-from ...pipeline.summary import SHORTEST_ARCMIN
+from ...pipeline.summary import bins_up_to
 from ...reconstruction.ccd_product import to_detector_axes
 from ...wavefront.request import Request, field_points, wavelength_points
 
@@ -32,7 +31,6 @@ _PUPIL = ((0.95, 20.0), (0.6, 140.0), (0.9, 260.0), (0.1, 340.0))
 _CCDS = 5
 # Change of a path by rounding, over the length of the path.
 _ROUNDING = 1e-13
-_CORRELATION_BINS = 15
 
 
 class Plan(Section):
@@ -187,9 +185,8 @@ class Scene:
 
     def _correlation_of(self, first: np.ndarray, second: np.ndarray) -> Correlation:
         fields = self.stars.fields
-        longest = max(float(np.hypot(*np.ptp(fields, axis=0))), 2.0 * SHORTEST_ARCMIN * ARCMIN)
         x, y = to_detector_axes(fields.T, self.camera_experiment.rotator)
-        bins = SeparationBins(SHORTEST_ARCMIN * ARCMIN, longest, _CORRELATION_BINS)
+        bins = bins_up_to(float(np.hypot(*np.ptp(fields, axis=0))))
         return shear_correlation(x, y, first, second, bins=bins)
 
 

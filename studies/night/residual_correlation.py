@@ -161,7 +161,7 @@ def _angle_per_length(experiment: Experiment) -> float:
 
 
 def _separation_bins(experiment: Experiment, exact: bool) -> SeparationBins:
-    """Return the bins of a night: from 0.5 arcmin to the largest separation on its CCDs."""
+    """Return the bins of a night: from 0.56 arcmin to beyond the largest separation on its CCDs."""
     camera = experiment.camera
     numbers = np.array([camera.ccd_index(name) for name in resolved_value(experiment.config.ccds)])
     extent = float(np.hypot(*np.ptp(camera.corners(numbers).reshape(-1, 2), axis=0)))

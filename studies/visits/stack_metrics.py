@@ -7,17 +7,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...core.units import ARCMIN, ARCSEC
-from ...measure.correlation import SEPARATION_RANGES, Correlation, SeparationBins, shear_correlation
+from ...measure.correlation import SEPARATION_RANGES, Correlation, shear_correlation
+from ...pipeline.summary import bins_up_to
 from .stack import PsfStack
 
 #: Correlations of a stack: of the true PSFs at all points, and of true minus model at stars and where no star is. With
 #: ``_g``, they are of g of the adaptive moments, else of the weighted e.
 KINDS = ("psf", "residual_stars", "residual_places", "psf_g", "residual_stars_g", "residual_places_g")
 StackCorrelations = dict[str, Correlation]
-# Smallest separation [arcmin].
-_LEAST = 1.0
-# Bins of separation.
-_BINS = 15
 # Side of a patch of the jackknife over that of a CCD.
 _PATCH = 3.0
 
@@ -49,7 +46,7 @@ def correlations(
     Errors are those of a jackknife over patches, where there are several.
     """
     extent = float(np.hypot(np.ptp(x), np.ptp(y)))
-    bins = SeparationBins(_LEAST * ARCMIN, max(min(extent, 180.0 * ARCMIN), 2.0 * _LEAST * ARCMIN), _BINS)
+    bins = bins_up_to(min(extent, SEPARATION_RANGES["long"][1] * ARCMIN))
     correlated = {}
     for kind, (e1, e2, rows) in values.items():
         several = len(np.unique(patch[rows])) > 1

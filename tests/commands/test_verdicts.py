@@ -195,8 +195,8 @@ STACKS = {
         ),
         (
             verdicts.model_verdict({"stars": 9, "used": 8, "rms_e_held_out": 0.012, "rms_e_noise": 0.01}),
-            "The PSF model is fitted to 8 of 9 stars; held out, it differs from them by 1.2 % rms in e, of which 1 % "
-            "is noise of the stars.",
+            "The PSF model is fitted to 8 of 9 stars; held out, it differs from them by 1.2 % rms in weighted e, "
+            "of which 1 % is noise of the stars.",
         ),
         (
             verdicts.model_verdict({"stars": 3, "used": 3, "rms_e_held_out": NAN, "rms_e_noise": NAN}),

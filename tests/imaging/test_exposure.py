@@ -58,6 +58,19 @@ def test_pixels_at_the_full_well_are_clipped_and_marked():
     assert not expose(scene, Exposure(exposures=3, noise=False), 1, "A").mask.any()
 
 
+@pytest.mark.parametrize("subtract_background", [True, False])
+def test_the_level_of_saturation_is_that_of_the_clipped_pixels_in_adu(subtract_background):
+    """As SExtractor and others compare it with the image, where its header has it as SATURATE."""
+    scene = SCENE.copy()
+    scene[10, 20], scene[200, 30] = 390_000.0, 450_000.0
+    settings = Exposure(exposures=4, gain=1.7, subtract_background=subtract_background)
+    found = expose(scene, settings, 1, "A")
+    assert ((found.image >= settings.saturation_level) == (found.mask == SATURATED)).all()
+    assert found.mask.sum() == 1
+    taken = 4 * BACKGROUND if subtract_background else 0.0
+    assert settings.saturation_level == pytest.approx((4e5 - taken) / 1.7, rel=1e-6)
+
+
 def test_random_numbers_belong_to_their_key_and_to_no_thread():
     one, four = (expose(SCENE, Exposure(), 1, "A", 0, threads=n).image for n in (1, 4))
     assert one.tobytes() == four.tobytes()

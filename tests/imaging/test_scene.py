@@ -188,6 +188,7 @@ def test_astropy_reads_image_uncertainty_mask_and_table(image, tmp_path):
         assert [hdu.name for hdu in hdus[1:]] == ["IMAGE", "VARIANCE", "MASK", "TRUTH"]
         assert (header["EXPTIME"], header["NEXP"], header["GAIN"], header["FILTER"]) == (6.0, 3, 1.0, "r")
         assert header["ZEROPNT"] == pytest.approx(28.36 + 2.5 * np.log10(6.0), abs=1e-6)
+        assert header["SATURATE"] == pytest.approx(3e5 - header["SKY"], abs=0.02)  # float32
         # Of no visit: instrument and detector, and the epoch of catalogues as the date.
         assert (header["INSTRUME"], header["DETECTOR"]) == ("LSSTCam", 94)
         assert (header["MJD-OBS"], header["DATE-OBS"]) == (51544.5, "2000-01-01T12:00:00.000")

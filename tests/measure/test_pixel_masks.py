@@ -145,6 +145,13 @@ def test_masks_go_back_to_where_they_came_from():
     x, y = np.array([1.0]), np.array([-1.5])
     centred = center_masks(mask, x, y, 9)
     assert np.array_equal(decenter_masks(centred, x, y, (12, 13)), mask)
+    # What is masked at the edge of a stamp goes on beyond it, to the edge of the image.
+    at_edge = np.zeros((1, 9, 9), dtype=bool)
+    at_edge[0, 3:6, 7:] = True
+    moved = decenter_masks(at_edge, np.array([0.4]), np.array([-0.3]), (12, 13))[0]
+    assert moved[5:7, 10:].all()
+    assert moved.any(axis=1).sum() == 4
+    assert not moved[:, :9].any()
 
 
 def test_neighbours_are_masked_to_below_the_noise():

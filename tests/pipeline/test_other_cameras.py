@@ -14,7 +14,7 @@ from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.run import run
 from pachon.pipeline.run_folder import finished_ccds, stamp_of
 from pachon.pipeline.sensor.displacement import EdgeRolloff
-from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_ccd
+from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_ccd, expose_positions
 from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.reconstruction.ccd_product import read_product
 from pachon.studies.sweep.file import load_sweep
@@ -146,6 +146,19 @@ def test_a_camera_file_counts_by_its_content(cameras):
     # Resolved, the path is absolute; a bundled name stays.
     assert small(cameras, camera="turned.yaml").config.camera == str(cameras / "turned.yaml")
     assert small(camera="decam", ccds=["N4"]).config.camera == "decam"
+
+
+@pytest.mark.parametrize(
+    ("telescope", "loss", "outer"), [("hsc", 0.103, (0.1, 0.1)), ("decam", 0.112, (-0.0169, 0.1917))]
+)
+def test_a_zero_point_is_that_of_a_star_on_the_axis(telescope, loss, outer):
+    """Measured zero points have in them what vanes and rims take from every star; it is not taken twice."""
+    experiment = small(telescope=telescope, ccds=None, wavelengths_nm=[640], psf={"engine": "long_exposure"})
+    assert experiment.lit_fraction_on_axis == pytest.approx(1.0 - loss, abs=2e-3)  # as `pachon vignetting` traces it
+    # By the rims of the pupil in place of 4096 rays.
+    axis, off_axis = expose_positions(experiment, np.array([[-0.01, 0.001], outer])).lit_fraction
+    assert axis == pytest.approx(1.0, abs=3e-3)
+    assert off_axis < axis
 
 
 def test_sweeps_find_a_camera_beside_them(cameras):

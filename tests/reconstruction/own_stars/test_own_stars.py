@@ -11,6 +11,7 @@ from astropy.table import Table
 from pachon import PsfModel
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError
+from pachon.measure.pixel_masks import clipped_stars
 from pachon.measure.shapes import measure_shapes
 from pachon.measure.star_selection import StarFlag
 from pachon.reconstruction.own_stars.own_stars import fit_own_stars
@@ -78,6 +79,34 @@ def test_the_model_is_that_of_the_truth_between_the_stars(own):
     assert np.sqrt(np.mean((made.size / true.size - 1.0) ** 2)) < 0.006
 
 
+def test_a_neighbour_cut_by_the_edge_of_a_stamp_leaves_the_star_as_it_is(stars, own):
+    """Its sharp edge would ring along whole rows when the star is centred."""
+    yy, xx = np.indices((SIZE, SIZE))
+    stamps = stars.stamps.copy()
+    stamps[20] += 5000.0 * np.exp(-((xx - SIZE) ** 2 + (yy - 19.0) ** 2) / (2.0 * 2.0**2))
+    found = fit_own_stars(stamps, stars.positions, PIXEL)
+    assert found.flags[20] & StarFlag.NEIGHBOUR
+    assert found.used[20]
+    number = int(np.flatnonzero(found.used).searchsorted(20))
+    rim = np.s_[:, :-12]  # free of the neighbour
+    difference = found.stamps[number][rim] - own.stamps[int(np.flatnonzero(own.used).searchsorted(20))][rim]
+    # Below the noise of a pixel, and a tenth of the ringing.
+    assert np.sqrt(np.mean(difference**2)) < 0.5 * SKY / own.electrons[number]
+
+
+def test_clipped_stars_are_left_out_without_a_level_of_saturation(stars, own):
+    """Where three pixels of a star have exactly its greatest value; those with fewer of that value are clipped too."""
+    level = np.sort(stars.stamps.max(axis=(1, 2)))[-6]
+    clipped = (stars.stamps >= level).any(axis=(1, 2))
+    found = fit_own_stars(np.minimum(stars.stamps, level), stars.positions, PIXEL)
+    assert ((found.flags & StarFlag.SATURATED) > 0).tolist() == clipped.tolist()
+    assert not found.used[clipped].any()
+    # Not where a level is given, nor in images without noise, whose stars may have equal pixels about a corner.
+    unclipped = fit_own_stars(np.minimum(stars.stamps, level), stars.positions, PIXEL, saturation=10.0 * level)
+    assert ((unclipped.flags & StarFlag.SATURATED) > 0).sum() < clipped.sum()
+    assert not clipped_stars(np.ones((5, 9, 9)), np.zeros((5, 9, 9), dtype=bool)).any()
+
+
 def test_residuals_of_held_out_stars_are_their_noise(own):
     d1, d2, size = own.residuals()
     assert 0.8 < np.std(np.concatenate([d1, d2]) / np.tile(own.sigma_e, 2)) < 1.35
@@ -88,6 +117,22 @@ def test_residuals_of_held_out_stars_are_their_noise(own):
         own.rho_statistics(1001)
     with pytest.raises(DomainError, match=r"positions: the stars lie within .* rad; expected 1e-10 to 6.283 rad"):
         replace(own, positions=1e-60 * own.positions).rho_statistics()
+
+
+def test_g_of_the_table_is_that_of_hsm(own):
+    """The weighted e is about half of it: a user who measures the stamps elsewhere must find the table's numbers."""
+    galsim = pytest.importorskip("galsim")
+    table = own.table()
+    used = np.flatnonzero(own.used)
+    for images, start in ((own.stamps, ""), (own.predicted, "held_out_")):
+        for row, image in zip(used[::9], images[::9], strict=True):
+            moments = galsim.hsm.FindAdaptiveMom(galsim.Image(image))
+            expected = [moments.observed_shape.g1, moments.observed_shape.g2, moments.moments_sigma * 0.2]
+            # Both iterate until steps are below 1e-6.
+            assert [table[start + name][row] for name in ("g1", "g2", "sigma")] == pytest.approx(expected, abs=2e-6)
+    assert np.isnan(table["g1"][5])
+    residual = np.stack([table[f"g{i}"] - table[f"held_out_g{i}"] for i in (1, 2)])[:, used]
+    assert own.summary()["rms_g_held_out"] == pytest.approx(np.sqrt((residual**2).mean()))
 
 
 @pytest.mark.long
