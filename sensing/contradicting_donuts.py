@@ -40,11 +40,11 @@ def fit_consistently(observations: Observations, basis: Basis, air: ExposureAir)
     """Return :func:`fit_hierarchy` of all donuts but those that the others contradict; arguments are the same."""
     left_out = np.zeros(len(observations.zernikes), dtype=bool)
     hierarchy = fit_hierarchy(observations, basis, air)
-    while (one := _farthest(without(observations, left_out), basis, air, left_out)).any():
-        trial = fit_hierarchy(without(observations, left_out | one), basis, air)
-        if _chi2(trial, observations, air, one) < _CONTRADICTED:
+    while (suspect := _farthest(without(observations, left_out), basis, air, left_out)).any():
+        trial = fit_hierarchy(without(observations, left_out | suspect), basis, air)
+        if _chi2(trial, observations, air, suspect) < _CONTRADICTED:
             break
-        hierarchy, left_out = trial, left_out | one
+        hierarchy, left_out = trial, left_out | suspect
     return Consistent(hierarchy, left_out)
 
 

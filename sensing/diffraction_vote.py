@@ -114,12 +114,12 @@ def _chi2_fall(rays: StarFit, waves: StarFit) -> float:
     by_rays, by_waves = rays.usable, waves.usable
     shape = (min(rows) for rows in zip(by_rays.model.shape, by_waves.model.shape, strict=True))
     stamp, middle = by_rays.full, central_slices(by_rays.model.shape, inner := tuple(shape))
-    other = central_slices(by_waves.model.shape, inner)
+    middle_of_waves = central_slices(by_waves.model.shape, inner)
     # In the unit of the rays' fit.
-    model = (by_waves.model[other] * waves.unit + waves.level - rays.level) / rays.unit
+    model = (by_waves.model[middle_of_waves] * waves.unit + waves.level - rays.level) / rays.unit
     residuals = (stamp.image[middle] - values for values in (by_rays.model[middle], model))
     before, after = (residual**2 / pixel_variance(stamp, by_rays.model)[middle] for residual in residuals)
-    return float((before - after)[stamp.used[middle] & by_waves.full.used[other]].sum())
+    return float((before - after)[stamp.used[middle] & by_waves.full.used[middle_of_waves]].sum())
 
 
 class DiffractionVote(NamedTuple):

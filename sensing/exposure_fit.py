@@ -162,9 +162,9 @@ class ExposureDonuts(WavefrontFit):
             hierarchy = consistent.hierarchy
         sides = None
         if behind.any() and not behind.all():
-            sizes, kept = hierarchy.sizes, ~consistent.left_out
+            sizes, good = hierarchy.sizes, ~consistent.left_out
             of_air = sizes.air**2 * air.shape
-            sides = pair_agreement(zernikes[kept], covariance[kept], star[kept], behind[kept], sizes.noise, of_air)
+            sides = pair_agreement(zernikes[good], covariance[good], star[good], behind[good], sizes.noise, of_air)
             sides = sides or _sides_apart(without(observations, consistent.left_out), basis, air, behind)
         exposure_result = ExposureWavefront(
             instrument.terms.requested,

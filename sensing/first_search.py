@@ -25,8 +25,8 @@ def first_solution(fitter: StarFitter, start: Start) -> Solution:
     if not _is_small(fitter, start, best):
         return best
     plain = fitter.without_wavefront().solve(start.stamp, start.unknowns, tolerance=tolerance)
-    other = fitter.solve(start.stamp, plain.stars[0], tolerance=tolerance)
-    return min(best, other, key=lambda fit: fit.loss + float(fit.shared @ fit.shared) / _LIKELY**2)
+    from_plain = fitter.solve(start.stamp, plain.stars[0], tolerance=tolerance)
+    return min(best, from_plain, key=lambda fit: fit.loss + float(fit.shared @ fit.shared) / _LIKELY**2)
 
 
 def _is_small(fitter: StarFitter, start: Start, solution: Solution) -> bool:
@@ -34,6 +34,6 @@ def _is_small(fitter: StarFitter, start: Start, solution: Solution) -> bool:
     instrument = fitter.instrument
     if instrument.known_seeing or not len(solution.shared):
         return False
-    begun, found = (float(instrument.seeing.fwhm(values[STRENGTH])) for values in (start.unknowns, solution.stars[0]))
-    fwhm = np.clip(found, begun, _MUCH_WIDER * begun)
+    begun, at_end = (float(instrument.seeing.fwhm(values[STRENGTH])) for values in (start.unknowns, solution.stars[0]))
+    fwhm = np.clip(at_end, begun, _MUCH_WIDER * begun)
     return bool(fitter.light.diameter < _FEW_WIDTHS * fwhm * fitter.light.scale)

@@ -324,8 +324,8 @@ class _Model:
             for donuts, precision in zip(group, inverse, strict=True):
                 design = self._design[donuts].reshape(-1, len(scale)) * scale
                 values, weighted = self._values[donuts].ravel(), precision @ design
-                others = curvature * np.outer(scale, scale) - design.T @ weighted
-                covariance = np.linalg.pinv(others, hermitian=True)
+                of_others = curvature * np.outer(scale, scale) - design.T @ weighted
+                covariance = np.linalg.pinv(of_others, hermitian=True)
                 residual = values - design @ covariance @ (scale * gradient - weighted.T @ values)
                 expected = np.linalg.inv(precision) + design @ covariance @ design.T
                 result[donuts] = residual @ np.linalg.solve(expected, residual) / len(values)

@@ -299,5 +299,5 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
     """Return the pseudo-inverse of a positive matrix; eigenvalues that rounding made negative count by their size."""
     values, vectors = np.linalg.eigh(matrix)
     sizes = np.abs(values)
-    kept = sizes > 1e-15 * sizes.max(initial=0.0)
-    return np.asarray((vectors[:, kept] / sizes[kept]) @ vectors[:, kept].T)
+    determined = sizes > 1e-15 * sizes.max(initial=0.0)
+    return np.asarray((vectors[:, determined] / sizes[determined]) @ vectors[:, determined].T)

@@ -111,7 +111,7 @@ HeldOperands = tuple[tuple[HeldOperand, ...], ...]
 def held_operands(operands: Sequence[Sequence[Operand]], *, exactly: bool) -> HeldOperands:
     """Return operands of configurations with the first of their goals and weights: the stated ones unless `exactly`."""
     factor = _FIRST_FACTOR if exactly else 1.0
-    return tuple(tuple(HeldOperand(operand, factor=factor) for operand in each) for each in operands)
+    return tuple(tuple(HeldOperand(operand, factor=factor) for operand in stated) for stated in operands)
 
 
 def with_operands(

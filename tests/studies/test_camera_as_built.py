@@ -114,5 +114,5 @@ def test_a_value_without_meaning_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "none.yaml").write_text("parameters: {focal_plane.heights: {values: [null, lsstcam]}}\n")
     assert main(["sweep", "none.yaml"]) == 2
-    message = "parameters.focal_plane.heights.values[0] = null: expected a number, a text, true or false\n"
+    message = "parameters.focal_plane.heights.values[0] = null: expected a finite number, a text, true or false\n"
     assert capsys.readouterr().err.endswith(message)
