@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..wavefront.psf.pupil_rims import pupil_rims
+from .first_search import FEW_WIDTHS
 from .fit_star import StarFit
 from .image_model import STRENGTH, LandedLight
 from .light import Instrument, diffracting_pieces
@@ -46,7 +47,7 @@ class _RimAmplitude:
 
 
 def _rim_amplitude(instrument: Instrument, star: StarSolution) -> _RimAmplitude | None:
-    """Return how much diffracted light an image has; None for stars in focus and images without air.
+    """Return how much diffracted light an image has; None for small images and those without air.
 
     Parameters
     ----------
@@ -57,7 +58,8 @@ def _rim_amplitude(instrument: Instrument, star: StarSolution) -> _RimAmplitude 
     """
     stamp, solution, light = star.stamp, star.solution, star.light
     unknowns, wave = solution.stars[0], solution.waves[0]
-    if not _has_air(star) or light.diameter < SMALLEST_DONUT * instrument.pixel:
+    blur = float(instrument.seeing.fwhm(unknowns[STRENGTH])) * light.scale
+    if not _has_air(star) or light.diameter < max(SMALLEST_DONUT * instrument.pixel, FEW_WIDTHS * blur):
         return None
     pieces = diffracting_pieces(light.diameter / stamp.grid.pixel)
     rims = pupil_rims(light.telescope, light.direction, instrument.middle, pieces)

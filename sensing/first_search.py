@@ -10,7 +10,7 @@ from .star_fitter import StarFitter, Start
 
 #: Width of an image without air over the FWHM of the seeing below which other wavefronts, in another seeing, explain it
 #: nearly as well: of 48 donuts of the LSST, 100 to 300 um from focus, 16 were wrong by 0.1 to 2 um.
-_FEW_WIDTHS = 8.0
+FEW_WIDTHS = 8.0
 #: Seeing over that where a search starts up to which it is that of a donut.
 _MUCH_WIDER = 2.0
 #: Wavefront that telescopes have, Z4 on, root of the summed squares [m]: of two that explain an image alike the smaller
@@ -26,7 +26,12 @@ def first_solution(fitter: StarFitter, start: Start) -> Solution:
         return best
     plain = fitter.without_wavefront().solve(start.stamp, start.unknowns, tolerance=tolerance)
     from_plain = fitter.solve(start.stamp, plain.stars[0], tolerance=tolerance)
-    return min(best, from_plain, key=lambda fit: fit.loss + float(fit.shared @ fit.shared) / _LIKELY**2)
+
+    def loss(fit: Solution) -> float:
+        wave = fit.shared[: len(fitter.instrument.noll)]
+        return fit.loss + float(wave @ wave) / _LIKELY**2
+
+    return min(best, from_plain, key=loss)
 
 
 def _is_small(fitter: StarFitter, start: Start, solution: Solution) -> bool:
@@ -36,4 +41,4 @@ def _is_small(fitter: StarFitter, start: Start, solution: Solution) -> bool:
         return False
     begun, at_end = (float(instrument.seeing.fwhm(values[STRENGTH])) for values in (start.unknowns, solution.stars[0]))
     fwhm = np.clip(at_end, begun, _MUCH_WIDER * begun)
-    return bool(fitter.light.diameter < _FEW_WIDTHS * fwhm * fitter.light.scale)
+    return bool(fitter.light.diameter < FEW_WIDTHS * fwhm * fitter.light.scale)
