@@ -264,9 +264,8 @@ class LongExposureRenderer(PsfRenderer):
         bounds = np.array([self.least_lit, *(least for least, _, _ in self.dense)])
         kinds = _NEAR - (lit[:, None] < bounds).sum(axis=1)
         if self._options.n_pupil is None:
-            assert self._atmosphere is not None, "images without air are those of the lattice"
-            rays = self._ray_counts(optics)
-            bent = bent_across_strips(optics, self.focal_length, self._diameter, self._atmosphere.r0)
+            rays, air = self._ray_counts(optics), self._atmosphere
+            bent = air is not None and bent_across_strips(optics, self.focal_length, self._diameter, air.r0)
             kinds = np.where(bent, -1 - len(self.dense), np.where(rays > 0, rays, kinds))
         if (kinds == _NEAR).all():
             return self._expose_spokes(optics, edges, stars, self._pupil)

@@ -154,6 +154,17 @@ def test_moments_of_optics_alone(lsst):
     assert np.isnan(moments.g1).all()
 
 
+def test_moments_of_optics_alone_on_wide_pixels(lsst, monkeypatch):
+    """Under pixels of 10 um strips along the rims suffice: against the lattice of the pupil."""
+    waves = [560e-9, 620e-9, 680e-9]
+    by_strips = pachon.psf_moments(lsst, FIELDS[:2], waves, threads=1)
+    monkeypatch.setattr(StatisticalRenderer.__bases__[0], "_strips_suffice", lambda renderer: False)
+    by_lattice = pachon.psf_moments(lsst, FIELDS[:2], waves, threads=1)
+    assert by_strips.e1 == pytest.approx(by_lattice.e1, abs=2e-3)
+    assert by_strips.e2 == pytest.approx(by_lattice.e2, abs=2e-3)
+    assert by_strips.size == pytest.approx(by_lattice.size, rel=0.01)
+
+
 def test_kernels_of_stars_are_gaussians():
     """Against exponentials in double precision, held at e; powers up to 400 of factors rounded to 6e-8: 2.4e-5."""
     random, reach = np.random.default_rng(1), 20
