@@ -205,10 +205,12 @@ def fit_donuts(
             return _Fitted(stars, solutions, fit.solved(usable, pool))
 
         def first(i: int) -> StarFit:
-            begun = vote.begun.get(i)
-            if i in vote.fitted or begun is None:
-                return vote.fitted.get(i) or alone(instrument, i)
-            return alone(instrument, i, replace(begun.with_light(instrument), searched=not vote.diffraction))
+            if i in vote.fitted:
+                return vote.fitted[i]
+            if i not in vote.begun:
+                return alone(instrument, i)
+            begun = vote.begun[i].with_light(instrument)
+            return alone(instrument, i, replace(begun, searched=not vote.diffraction))
 
         def once_more(refined: Instrument) -> _Fitted:
             return fitted_stars(refined, lambda i: alone(refined, i, replace(fitted.stars[i], searched=True)))
