@@ -15,7 +15,9 @@ from ...models.telescope import Telescope
 from ...raytrace.kernels.surface_table import STOPPED
 from ...raytrace.launch import launch_bundles
 from ...raytrace.pack.surfaces import clear_annulus, pack_surfaces
-from ...raytrace.trace import trace_packets
+from ...raytrace.rays import RayStatus
+from ...raytrace.trace import trace, trace_packets
+from ..pupil_sampling import spiral_annulus
 from .clear_pupil_kernels import find_edges, square_distances
 
 # Spokes per ring: the phase of a blur varies some three times faster around the pupil than across its ring.
@@ -24,6 +26,13 @@ _SPOKES_PER_RING = 3.2
 MOST_RINGS = 12
 #: Rays on a spoke that determine the rims of apertures, by parabolas.
 EDGE_RINGS = 3
+# Spokes to the area of a pupil that only discs and rings cut; 16 are good to 3e-4 at the edge of the LSST's field.
+_AREA_SPOKES = 32
+# Rays to that of others: good to 3e-3 (rms) behind the vanes of DECam and at the edge of HSC's field. Rows of a lattice
+# would lie along vanes.
+_AREA_RAYS = 1000
+# Most stars whose rays are traced together.
+_STARS = 64
 
 
 @dataclass(frozen=True)
@@ -75,6 +84,33 @@ class SpokePupil:
         """One over the differences of the radii [1/m], shape [n_ring, n_ring]; 0 on the diagonal."""
         difference = self.radius[:, None] - self.radius
         return np.divide(1.0, difference, out=np.zeros_like(difference), where=difference != 0.0)
+
+
+def lit_fractions(
+    telescope: Telescope, direction: np.ndarray, wavelength: float, threads: int | None = None
+) -> np.ndarray:
+    """Return the parts of the area of the entrance pupil whose light passes all apertures, shape [n_star].
+
+    ``direction`` [n_star, 3] is that of the light's travel; the wavelength [m] is that in vacuum.
+    """
+    radius, obscuration = 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration
+    if has_only_annuli(telescope):
+        unit = SpokePupil.fill(2.0 * radius, obscuration, 3 * _AREA_SPOKES, 3).unit
+        edges = clear_edges(telescope, direction, unit, wavelength, threads)
+        return clear_areas(edges) / (math.pi * radius**2 * (1.0 - obscuration**2))
+    points = spiral_annulus(radius, obscuration, _AREA_RAYS).points
+    fractions = []
+    for first in range(0, len(direction), _STARS):
+        some = direction[first : first + _STARS]
+        rays = launch_bundles(telescope, some, wavelength, points)
+        lit = trace(telescope, rays, threads=threads).status == RayStatus.OK
+        fractions.append(lit.reshape(len(some), -1).mean(axis=1))
+    return np.concatenate(fractions)
+
+
+def clear_areas(edges: np.ndarray) -> np.ndarray:
+    """Return the areas between the edges of :func:`clear_edges` [m^2], shape [n_star]."""
+    return np.asarray(math.pi * (edges[..., 1] ** 2 - edges[..., 0] ** 2).mean(axis=1))
 
 
 def clear_edges(

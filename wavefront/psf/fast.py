@@ -35,6 +35,7 @@ from ...core.warp_arrays import warp_array
 from ..atmosphere.layer_screens import SLOPE_LAG
 from ..atmosphere.turbulence import coherence, diffraction_otf, slope_variance, structure_function
 from ..pupil_optics import PupilOptics
+from .clear_pupil import lit_fractions
 from .engine import ExposedStars, PsfEngine, PsfInputs, PsfRenderer, Stars, expose_by_kind, metric_of
 from .far_from_focus import sampling_refinement
 from .fast_kernels import combine_wavelengths, deposit_rays
@@ -142,9 +143,8 @@ class FastRenderer(PsfRenderer):
     ) -> None:
         super().__init__(inputs)
         self._options, self._refinement = options, refinement
-        #: Inner radius of the points over the outer one, and their area over that of the pupil.
+        #: Inner radius of the points over the outer one.
         self._inner = traced_obscuration(self._obscuration) if far_from_focus else self._obscuration
-        self._area = (1.0 - self._inner**2) / (1.0 - self._obscuration**2)
         still, n_pupil, oversampling = inputs.atmosphere is None, options.n_pupil, options.oversampling
         if n_pupil is None:
             n_pupil = PUPIL_POINTS_STILL if still else PUPIL_POINTS
@@ -276,7 +276,14 @@ class FastRenderer(PsfRenderer):
         def draw(shift: np.ndarray | None) -> np.ndarray:
             return self._stamps(combined, total, shift)
 
-        return ExposedStars(draw, self._area * optics.lit.mean(axis=2), optics.reference_points)
+        return ExposedStars(draw, self._lit_fraction(optics, stars), optics.reference_points)
+
+    def _lit_fraction(self, optics: PupilOptics, stars: Stars) -> np.ndarray:
+        """Return the lit fractions of the pupil, [n_star, n_wave]; the points of an image are too few for them."""
+        # Apertures cut all wavelengths alike.
+        middle = float(self._wavelengths[len(self._wavelengths) // 2])
+        fraction = lit_fractions(self._telescope, self._direction(stars.fields), middle, self._threads)
+        return np.where(optics.lit.any(axis=2), fraction[:, None], 0.0)
 
     def _transforms(self, deposit: np.ndarray, optics: PupilOptics, light: np.ndarray) -> np.ndarray:
         """Return the transforms of the binned rays, shape [n_star, n_channel, ky, kx]."""

@@ -46,7 +46,7 @@ from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
 from ..atmosphere.turbulence import coherence, structure_function
 from ..pupil_optics import PupilOptics
-from .clear_pupil import SpokePupil, clear_edges, has_only_annuli
+from .clear_pupil import SpokePupil, clear_areas, clear_edges, has_only_annuli
 from .engine import ExposedStars, PsfEngine, PsfInputs, PsfRenderer, Stars, expose_by_kind, metric_of
 from .far_from_focus import bent_across_strips
 from .lattice_pupil import (
@@ -393,13 +393,9 @@ class LongExposureRenderer(PsfRenderer):
         middle = float(self._wavelengths[len(self._wavelengths) // 2])
         return clear_edges(self._telescope, self._direction(fields), pupil.unit, middle, self._threads)
 
-    def _clear_area(self, edges: np.ndarray) -> np.ndarray:
-        """Return the clear areas of the pupil [m^2], [n_star]."""
-        return np.asarray(math.pi * (edges[..., 1] ** 2 - edges[..., 0] ** 2).mean(axis=1))
-
     def _lit_fraction(self, edges: np.ndarray) -> np.ndarray:
         inner, outer = self._pupil.radius[[0, -1]]
-        return self._clear_area(edges) / (math.pi * (outer**2 - inner**2))
+        return clear_areas(edges) / (math.pi * (outer**2 - inner**2))
 
     def _expose_spokes(self, optics: PupilOptics, edges: np.ndarray, stars: Stars, pupil: SpokePupil) -> ExposedStars:
         spectrum = self._exposed_spectra(self._transform(optics, edges, stars.photons, pupil), optics)
@@ -434,7 +430,7 @@ class LongExposureRenderer(PsfRenderer):
                 warp_array(channels.shift.reshape(n_wave, depths), wp.float64),
                 warp_array(channels.of_wavelength(channels.shift), wp.float64),
                 self.period,
-                warp_array(self._clear_area(edges), wp.float64),
+                warp_array(clear_areas(edges), wp.float64),
                 wp.empty((n_star, pupil.n_spoke, len(pupil.radius), n_wave), dtype=wp.vec4d, device="cpu"),
                 *points,
             ],

@@ -17,7 +17,7 @@ from ..atmosphere.turbulence import structure_function
 from ..pupil_optics import PupilOptics
 from ..pupil_polynomials import PupilPolynomials
 from ..pupil_sampling import spiral_annulus
-from .engine import PsfInputs
+from .engine import PsfInputs, Stars
 from .far_from_focus import blur_radii
 from .fast import FastEngine, FastRenderer
 from .image_plane import square_transfer
@@ -68,8 +68,13 @@ class MeanRaysRenderer(FastRenderer):
         super().__init__(replace(inputs, atmosphere=None), options, far_from_focus=True)
 
     def _place_pupil(self, n_pupil: int) -> None:
+        # Area of the points over that of the pupil.
+        self._area = (1.0 - self._inner**2) / (1.0 - self._obscuration**2)
         self._points = spiral_annulus(0.5 * self._diameter, self._inner, int(self._area * n_pupil)).points
         self._weights = np.ones(len(self._points))
+
+    def _lit_fraction(self, optics: PupilOptics, stars: Stars) -> np.ndarray:
+        return np.asarray(self._area * optics.lit.mean(axis=2))
 
     def _make_grid(self) -> None:
         super()._make_grid()
