@@ -43,6 +43,17 @@ _OF_STARS = (
 )
 
 
+def _excess_curvature(jacobian: np.ndarray, exit_jacobian: np.ndarray, sphere_curvature: float) -> np.ndarray:
+    """Return the curvature of reference spheres beyond that of spheres through the exit pupil [1/m], [n_star, 2, 2]."""
+    return np.asarray(exit_jacobian @ np.linalg.inv(jacobian) + sphere_curvature * np.eye(2))
+
+
+def _between_spheres(displacement: np.ndarray, excess: np.ndarray) -> np.ndarray:
+    """Return paths from reference spheres to those of an excess curvature [m], [n_star, n_wave, n_pupil]."""
+    landing = displacement.astype(np.float64)
+    return np.asarray(0.5 * np.einsum("swpi,sij,swpj->swp", landing, excess, landing))
+
+
 @dataclass(frozen=True)
 class PupilOptics:
     """Landing points and optical paths through given points of the entrance pupil.
@@ -88,11 +99,8 @@ class PupilOptics:
         Its gradient along the pupil is the inverse of the Jacobian times the displacement, out of focus too: waves of
         this phase land where rays do. On another sphere the image has another scale, in proportion to the defocus.
         """
-        # Curvature of the reference sphere beyond that of the sphere through the exit pupil.
-        excess = self.exit_jacobian @ np.linalg.inv(self.jacobian) + self.sphere_curvature * np.eye(2)
-        landing = self.displacement.astype(np.float64)
-        squares = np.einsum("swpi,sij,swpj->swp", landing, excess, landing)
-        return np.asarray(self.path + 0.5 * squares)
+        excess = _excess_curvature(self.jacobian, self.exit_jacobian, self.sphere_curvature)
+        return np.asarray(self.path + _between_spheres(self.displacement, excess))
 
     @property
     def exit_cosines(self) -> np.ndarray:
@@ -204,11 +212,14 @@ def trace_pupils(
     if aberration is not None:
         # The path is minus the OPD; light is displaced by the Jacobian times the gradient of the path, as by a screen.
         x, y = pupil.T
-        path -= aberration.opd(x, y, request.slopes)[:, None]
+        excess = _excess_curvature(jacobian, index * turn, index / radius)
+        path += _between_spheres(offset, excess) - aberration.opd(x, y, request.slopes)[:, None]
         along_x, along_y = np.moveaxis(aberration.gradient(x, y, request.slopes), -1, 0)
         for axis in range(2):
             shift = jacobian[:, axis, 0, None] * along_x + jacobian[:, axis, 1, None] * along_y
             offset[..., axis] -= shift[:, None]
+        # It adds to the path to spheres through the exit pupil: the reference sphere is met elsewhere.
+        path -= _between_spheres(offset, excess)
     return PupilOptics(
         pupil=pupil,
         displacement=offset.astype(np.float32),
