@@ -34,6 +34,7 @@ from .request import Request
 _OF_STARS = (
     "displacement",
     "path",
+    "by_aberration",
     "lit",
     "jacobian",
     "exit_jacobian",
@@ -41,17 +42,6 @@ _OF_STARS = (
     "reference_cosines",
     "fields",
 )
-
-
-def _excess_curvature(jacobian: np.ndarray, exit_jacobian: np.ndarray, sphere_curvature: float) -> np.ndarray:
-    """Return the curvature of reference spheres beyond that of spheres through the exit pupil [1/m], [n_star, 2, 2]."""
-    return np.asarray(exit_jacobian @ np.linalg.inv(jacobian) + sphere_curvature * np.eye(2))
-
-
-def _between_spheres(displacement: np.ndarray, excess: np.ndarray) -> np.ndarray:
-    """Return paths from reference spheres to those of an excess curvature [m], [n_star, n_wave, n_pupil]."""
-    landing = displacement.astype(np.float64)
-    return np.asarray(0.5 * np.einsum("swpi,sij,swpj->swp", landing, excess, landing))
 
 
 @dataclass(frozen=True)
@@ -65,6 +55,7 @@ class PupilOptics:
     pupil: np.ndarray  #: [n_pupil, 2] m, entrance-pupil coordinates
     #: [n_star, n_wave, n_pupil, 2] m, float32: landing point on the CCD minus reference point, x and y of the detector
     displacement: np.ndarray
+    by_aberration: np.ndarray  #: [n_star, n_pupil, 2] m: part of it by an added aberration
     #: [n_star, n_wave, n_pupil] m: path to the reference sphere minus that of the chief ray, the negative of the OPD
     path: np.ndarray
     lit: np.ndarray  #: [n_star, n_wave, n_pupil] bool
@@ -99,8 +90,12 @@ class PupilOptics:
         Its gradient along the pupil is the inverse of the Jacobian times the displacement, out of focus too: waves of
         this phase land where rays do. On another sphere the image has another scale, in proportion to the defocus.
         """
-        excess = _excess_curvature(self.jacobian, self.exit_jacobian, self.sphere_curvature)
-        return np.asarray(self.path + _between_spheres(self.displacement, excess))
+        # Curvature of the reference sphere beyond that of the sphere through the exit pupil.
+        excess = self.exit_jacobian @ np.linalg.inv(self.jacobian) + self.sphere_curvature * np.eye(2)
+        # An added aberration is one of the path to these spheres already.
+        landing = self.displacement.astype(np.float64) - self.by_aberration[:, None]
+        squares = np.einsum("swpi,sij,swpj->swp", landing, excess, landing)
+        return np.asarray(self.path + 0.5 * squares)
 
     @property
     def exit_cosines(self) -> np.ndarray:
@@ -209,20 +204,20 @@ def trace_pupils(
     path = traced_path - chief_path[:, :, None]
     index = float(light[request.middle_index, -3])
     jacobian, turn = chief_ray_derivatives(telescope, direction, request.middle, threads)
+    by_aberration = np.broadcast_to(0.0, (n_star, n_pupil, 2))
     if aberration is not None:
         # The path is minus the OPD; light is displaced by the Jacobian times the gradient of the path, as by a screen.
         x, y = pupil.T
-        excess = _excess_curvature(jacobian, index * turn, index / radius)
-        path += _between_spheres(offset, excess) - aberration.opd(x, y, request.slopes)[:, None]
+        path -= aberration.opd(x, y, request.slopes)[:, None]
         along_x, along_y = np.moveaxis(aberration.gradient(x, y, request.slopes), -1, 0)
+        by_aberration = np.empty((n_star, n_pupil, 2))
         for axis in range(2):
-            shift = jacobian[:, axis, 0, None] * along_x + jacobian[:, axis, 1, None] * along_y
-            offset[..., axis] -= shift[:, None]
-        # It adds to the path to spheres through the exit pupil: the reference sphere is met elsewhere.
-        path -= _between_spheres(offset, excess)
+            by_aberration[..., axis] = -(jacobian[:, axis, 0, None] * along_x + jacobian[:, axis, 1, None] * along_y)
+        offset += by_aberration[:, None]
     return PupilOptics(
         pupil=pupil,
         displacement=offset.astype(np.float32),
+        by_aberration=by_aberration,
         path=path,
         lit=status == RayStatus.OK,
         jacobian=jacobian,

@@ -85,6 +85,7 @@ class PolynomialPupil:
         return PupilOptics(
             pupil=np.asarray(pupil),
             displacement=same(landing.astype(np.float32)),
+            by_aberration=np.zeros((len(fields), len(x), 2)),
             path=same(path),
             lit=np.broadcast_to(lit, (len(fields), len(wavelengths), len(x))).copy(),
             jacobian=np.broadcast_to(jacobian, (len(fields), 2, 2)).copy(),

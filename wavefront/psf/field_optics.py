@@ -124,6 +124,7 @@ class FieldOptics:
         return PupilOptics(
             pupil=self.pupil,
             displacement=displacement,
+            by_aberration=np.broadcast_to(np.nan, (n_star, n_pupil, 2)),
             path=np.broadcast_to(np.nan, (n_star, n_wave, n_pupil)),
             lit=np.repeat(self._lit(edges)[:, None], n_wave, axis=1),
             jacobian=jacobian,

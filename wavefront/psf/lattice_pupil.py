@@ -152,7 +152,8 @@ class LatticeTransfer:
         if not lit.size:
             return out
         pupil, displacement = star_optics.pupil[lit], star_optics.displacement[:, :, lit]
-        star_optics = replace(star_optics, pupil=pupil, displacement=displacement)
+        by_aberration = star_optics.by_aberration[:, lit]
+        star_optics = replace(star_optics, pupil=pupil, displacement=displacement, by_aberration=by_aberration)
         path = star_optics.path[:, :, lit]
         if len(self.wavelengths) > 1:
             path = path + np.einsum("wt,pt->wp", rays.path[star], self._terms(pupil, _DEGREE))
