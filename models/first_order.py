@@ -357,7 +357,10 @@ def _trace(
     """
     w = length(telescope.default_wavelength if wavelength is None else wavelength, "wavelength")
     telescope.check_wavelength(w)
-    surfaces = unfolded_axis(telescope).surfaces
+    try:
+        surfaces = unfolded_axis(telescope).surfaces
+    except DomainError as error:
+        raise error.followed_by("parabasal_optics serves telescopes that are not centred") from None
     if all(surface.fold for surface in surfaces):
         raise DomainError(f"telescope {telescope.name}: expected at least one mirror or lens surface")
     curvature = -np.array([s.curvature for s in surfaces])
