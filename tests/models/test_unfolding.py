@@ -137,7 +137,7 @@ def test_what_is_off_the_axis_is_refused():
 
 def test_tilted_windows_behind_a_fold_have_two_focal_lengths(auxtel_moved):
     """The wedges of LATISS are no surfaces of a centred system, wherever its detector is; parabasal rays serve."""
-    with pytest.raises(DomainError, match="L1_entrance.*on the axis behind the folds; parabasal_optics serves"):
+    with pytest.raises(DomainError, match=r"L1_entrance.*on the axis behind the folds; parabasal_optics serves"):
         first_order(auxtel_moved)
     # Chief rays of close fields, in the plane of the fold and across it.
     step, telescope = 1e-6, auxtel_moved
