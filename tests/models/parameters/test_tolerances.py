@@ -239,3 +239,23 @@ def test_the_page_runs(tmp_path, monkeypatch, capsys):
     (tmp_path / "modes.yaml").write_text(example)
     dof = pachon.load_degrees_of_freedom(tmp_path / "modes.yaml")
     assert dof.apply(names["telescope"], np.ones(4)) != names["telescope"]
+
+
+@pytest.mark.parametrize("merit", ["wavefront", "spots"])
+@pytest.mark.parametrize(
+    ("tolerances", "compensators"),
+    [
+        # By symmetry the focus does not respond to a decentre, nor a tilt to a focus, to first order.
+        ([Tolerance("M2.dx", 1e-3)], ["Camera.dz"]),
+        ([Tolerance("M2.dx", 1e-3)], ["Camera.rx"]),
+        ([Tolerance("M2.dz", 1e-4)], ["Camera.rx", "Camera.dz"]),
+    ],
+)
+def test_quadratic_merit_where_compensators_do_not_respond_to_first_order(lsst_r, merit, tolerances, compensators):
+    request = pachon.Request.of(lsst_r, [[0.0, 0.0]], n_pupil=4)
+    traced, quadratic = (
+        monte_carlo(request, tolerances, merit, 4, 3, compensators=compensators, method=method).merit
+        for method in ("traced", "quadratic")
+    )
+    # Terms of third order in deviations of a millimetre.
+    assert quadratic == pytest.approx(traced, rel=1e-3)
