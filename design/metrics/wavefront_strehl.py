@@ -9,15 +9,17 @@ from scipy.ndimage import maximum_filter
 _STEP = 0.2
 #: Largest tilt [waves] of the search: an image whose brightest point is farther off has a ratio of a few per cent.
 _FARTHEST = 4.0
-#: Largest tilt of the search for a wavefront of a range, both in waves: the ring about an image that defocus has made dark
-#: in its middle, and the slope of its rim.
-_RING, _SLOPE = 1.0, 3.0
+#: Tilt [waves] of the ring about an image that defocus has made dark in its middle.
+_RING = 1.0
+#: Slope of a wavefront at its rim, over its largest deviation.
+_SLOPE = 3.0
 #: Largest range of a wavefront [waves] over the root of the number of points. Beyond it, phases between neighbours
 #: differ by more than half a wave at the rim, and points in a regular pattern add up to ratios that mean nothing.
 _LARGEST = 0.2
-#: Irradiance, over the largest found, and number of the maxima of the search that are followed to their peaks: between
-#: two steps a peak loses up to a fifth.
-_CLOSE, _PEAKS = 0.8, 4
+#: Irradiance, over the largest found, of a maximum that may be the highest: between two steps a peak loses a fifth.
+_CLOSE = 0.8
+#: Maxima that are followed to their peaks, at most.
+_PEAKS = 4
 #: Steps of Newton's method from such a maximum.
 _NEWTON = 5
 #: Step [waves] that ends Newton's method; the ratio goes with its square.
