@@ -151,3 +151,15 @@ def test_tilted_windows_behind_a_fold_have_two_focal_lengths(auxtel_moved):
         lengths.append(np.hypot(*(x - y)) / (2.0 * np.tan(step)))
     # The detector is 0.1 mm from the foci, and the exit pupil 4.4 m from it.
     assert pachon.models.parabasal_optics(telescope, 620e-9).focal_length == pytest.approx(lengths, rel=2e-4)
+
+
+@pytest.mark.parametrize("folds", [False, True])
+def test_a_plane_across_the_axis_may_be_moved_in_itself(folds):
+    rows = [(0.0, 4.0, -1.0, None), (1.0, np.inf, 0.0, 1.5), (1.1, np.inf, 0.0, 1.0)]
+    plain = telescope_of(rows, stop_z=0.5, diameter=0.4)
+    telescope = folded(plain, 1, 0.5, (0.0, 1.0, 1.0)) if folds else plain
+    # The light behind the fold travels along y.
+    moved = telescope.perturbed("s1", shift=(0.01, 0.0, 0.0)).perturbed("s2", shift=(0.0, 0.0, 0.02 if folds else 0.0))
+    same(first_order(moved), first_order(telescope))
+    with pytest.raises(DomainError, match="s1 of test: expected one on the axis"):
+        first_order(telescope.perturbed("s1", tilt=(1e-6, 0.0, 0.0)))
