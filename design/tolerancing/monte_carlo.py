@@ -109,7 +109,7 @@ class MonteCarlo(Result):
             units=units[:count],
             compensator_units=units[count:],
             deviations=deviations,
-            moves=toleranced.moves(deviations),
+            moves=(toleranced.quadratic_moves if method == "quadratic" else toleranced.moves)(deviations),
             merit=traced,
             nominal=nominal,
             contribution=toleranced.contribution,

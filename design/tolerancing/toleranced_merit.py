@@ -146,6 +146,12 @@ class TolerancedMerit:
         square = start + deviations @ g + 0.5 * np.einsum("ni,ij,nj->n", deviations, h, deviations)
         return np.sqrt(np.maximum(square, 0.0))
 
+    def quadratic_moves(self, deviations: np.ndarray) -> np.ndarray:
+        """Return the compensators at the least of :meth:`quadratic` for deviations, shape [n, n_compensator]."""
+        _, gradient, hessian = self.second_order
+        n = len(self.tolerances)
+        return -(gradient[n:] + deviations @ hessian[:n, n:]) @ _scaled_inverse(hessian[n:, n:])
+
     @cached_property
     def second_order(self) -> tuple[float, np.ndarray, np.ndarray]:
         """Square of the merit [m^2], its gradient, and its second derivatives by differences of exact gradients.
