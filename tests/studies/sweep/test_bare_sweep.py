@@ -78,9 +78,9 @@ def test_metrics_of_images():
     lens = pachon.load_telescope(LENS)
     fields, waves = np.deg2rad(FIELDS), np.array([587.6e-9])
     scene = TelescopeScene(lens, fields, waves)
-    found = {
-        key: value for name in ("ee80", "mtf", "throughput") for key, value in TELESCOPE_METRICS[name](scene).items()
-    }
+    found = {}
+    for name in ("ee80", "mtf", "throughput"):
+        found |= TELESCOPE_METRICS[name].compute(scene)
     radii = (
         pachon.encircled_energy(pachon.fft_psf(lens, fields, waves, pixels=128, n_pupil=256)).radius_holding(0.8) * 1e6
     )
