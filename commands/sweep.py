@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
-from ..core.errors import ConfigError
+from ..core.errors import ConfigError, DomainError
 from ..core.terminal import print_line
 from ..core.threads import thread_count
 from . import completion
@@ -91,12 +91,15 @@ def sweep_run(
     ) as execution:
         outcome = _run(path, store, settings or (), execution)
     if not (as_json or quiet):
-        print_line(outcome.pop("verdict") or "No point could be computed.")
+        print_line(outcome.pop("verdict"))
     _show(outcome, as_json, quiet)
 
 
 def _run(path: Path, store: Path, settings: Sequence[str], execution: Execution) -> dict[str, Any]:
-    """Compute the points that are missing, write the report, and return the counts."""
+    """Compute the points that are missing, write the report, and return the counts.
+
+    DomainError where no point can be computed; the store stays.
+    """
     from ..studies.sweep.analysis import summary, verdict
     from ..studies.sweep.file import load_sweep
     from ..studies.sweep.report import write_report
@@ -105,9 +108,11 @@ def _run(path: Path, store: Path, settings: Sequence[str], execution: Execution)
     from ..studies.sweep.table import read_table
 
     outcome = run_sweep(load_sweep(path, settings), store, folder=path.parent, execution=execution)
-    report = sentence = None
-    if outcome.failed < outcome.points:
-        with execution.reporter.stage("report"), SweepStore(store) as opened:
+    with SweepStore(store) as opened:
+        if outcome.failed == outcome.points:
+            first = opened.results()[0]
+            raise DomainError(f"no point can be computed; point {first.number}: {first.problem}", file=store)
+        with execution.reporter.stage("report"):
             report = str(write_report(opened, _report_folder(store)))
             sentence = verdict(summary(read_table(opened), opened.sweep))
     counts = {key: getattr(outcome, key) for key in ("points", "kept", "computed", "failed")}

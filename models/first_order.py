@@ -27,6 +27,7 @@ from ..core.plotting import BLUE, RED, axes_at, styled
 from ..core.point_plots import draw_bars
 from ..core.result import Result, Values
 from ..core.units import ARCSEC, angle, finite, length, metres
+from .central_obscuration import central_obscuration
 from .paraxial import require_on_axis
 from .surface import Interaction
 from .telescope import Telescope
@@ -231,7 +232,7 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
         entrance_pupil_diameter=telescope.pupil_diameter,
         exit_pupil_z=last_z - to_pupil,
         exit_pupil_diameter=2 * abs(height + behind * to_pupil),
-        effective_area=math.pi * radius**2 * (1 - telescope.pupil_obscuration**2),
+        effective_area=math.pi * radius**2 * (1 - central_obscuration(telescope) ** 2),
         # The chief ray has unit slope in front; along an axis that mirrors turn, slopes change their sign with it.
         angular_magnification=math.inf if telescope.design_data.telecentric else math.copysign(1.0, n) * ub,
         image_z=last_z + height / behind if behind else math.inf,
@@ -356,7 +357,10 @@ def _trace(
     """
     w = length(telescope.default_wavelength if wavelength is None else wavelength, "wavelength")
     telescope.check_wavelength(w)
-    surfaces = unfolded_axis(telescope).surfaces
+    try:
+        surfaces = unfolded_axis(telescope).surfaces
+    except DomainError as error:
+        raise error.followed_by("parabasal_optics serves telescopes that are not centred") from None
     if all(surface.fold for surface in surfaces):
         raise DomainError(f"telescope {telescope.name}: expected at least one mirror or lens surface")
     curvature = -np.array([s.curvature for s in surfaces])

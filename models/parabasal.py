@@ -215,6 +215,16 @@ def stop_center_point(telescope: Telescope, wavelength: float) -> np.ndarray:
     raise DomainError(f"{telescope.name}: no ray on the axis passes the middle of the stop {stop!r}")
 
 
+def axis_ray_at(telescope: Telescope, place: int, radius: float) -> _Ray:
+    """Return the ray of the axis that is `radius` [m] along y from the middle of the pupil, in the frame of a surface.
+
+    Of an object at a finite distance it comes from its point on the axis. DomainError if it does not reach the surface.
+    """
+    x, y = telescope.pupil_center
+    rays = _traced(telescope, telescope.default_wavelength, _axis_ray(telescope, np.array([x, y + radius])), place + 1)
+    return rays[-1].within(telescope.surfaces[place])
+
+
 def _axis_ray(telescope: Telescope, point: np.ndarray) -> _Ray:
     """Return the ray of the object on the axis through a point [2] at z = ``stop_z``, with neighbours beside it."""
     place, direction, turned = np.array([*point, telescope.stop_z]), np.array([0.0, 0.0, -1.0]), np.zeros((3, 2))

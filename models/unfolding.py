@@ -86,9 +86,11 @@ def unfolded_axis(telescope: Telescope) -> UnfoldedAxis:
             offset = householder @ (offset - vertex) + vertex
             reflection = householder @ reflection
             continue
-        if not folded:
+        # A plane across the axis may be moved in itself.
+        beside = 0.0 if is_flat(surface.shape) and surface.thin_lens is None else float(np.hypot(*vertex[:2]))
+        if not folded and (beside or tilt or normal[2] < 0):
             require_on_axis(surface, telescope.name)
-        elif tilt > _ROUNDING or float(np.hypot(*vertex[:2])) > _ROUNDING * size:
+        elif folded and (tilt > _ROUNDING or beside > _ROUNDING * size):
             raise DomainError(f"surface {surface.name} of {telescope.name}: expected one on the axis behind the folds")
         sense = 1.0 if normal[2] > 0 else -1.0
         along_x, along_y = (sense * c for c in curvatures_across(surface, axes))

@@ -145,11 +145,10 @@ def _shown_unit(result: Any, unit: str) -> tuple[str, float]:
 
 
 def _operand_unit(result: Any, operand: Operand) -> tuple[str, float]:
-    if operand.stated is not None:
-        return operand.stated.unit or "1", operand.stated.size
-    if operand.unit == "rad":
-        return "deg", math.radians(1.0)
-    return _SMALL.get(operand.kind, _shown_unit(result, operand.unit))
+    if operand.stated is None and operand.unit == "m":
+        return _SMALL.get(operand.kind, _shown_unit(result, "m"))
+    unit, size = operand.shown_unit
+    return unit or "1", size
 
 
 def _of_variables(name: str) -> Callable[[Any], list[float]]:

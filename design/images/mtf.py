@@ -25,6 +25,7 @@ from ...core.errors import DomainError
 from ...core.plotting import BLUE, RED, figure_at, styled
 from ...core.threads import one_blas_thread
 from ...core.units import MOST, arcseconds, require_count
+from ...models.central_obscuration import central_obscuration
 from ...models.telescope import Telescope
 from ...raytrace.rays import Projection
 from ...wavefront.request import Request
@@ -232,7 +233,7 @@ def mtf(
         geometric_sagittal=geometric[1],
         f_number=principal.f_number,
         plate_scale=principal.plate_scale,
-        obscuration=telescope.pupil_obscuration,
+        obscuration=central_obscuration(telescope),
     )
 
 

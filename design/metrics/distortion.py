@@ -229,14 +229,14 @@ def _draw_picture(axes: Axes, result: Distortion) -> None:
     # A round factor that makes the largest shift some 6 % of the picture.
     factor = 10.0 ** np.floor(np.log10(0.06 * extent / max(largest, 1e-12 * extent)))
     factor *= next(m for m in (5.0, 2.0, 1.0) if m * factor * largest <= 0.06 * extent or m == 1.0)
-    lines = _neighbours(result.fields)
+    moved, lines = predicted + factor * shift, _neighbours(result.fields)
     if len(lines):
         axes.add_collection(LineCollection(list(predicted[lines]), colors="0.75", linewidths=0.7))
-        moved = predicted + factor * shift
         axes.add_collection(LineCollection(list(moved[lines]), colors=BLUE, linewidths=0.9))
     else:
         axes.plot(*predicted.T, "+", color="0.6")
-    axes.plot(*(predicted + factor * shift).T, ".", color=BLUE, markersize=3.0)
+        axes.add_collection(LineCollection(list(np.stack([predicted, moved], axis=1)), colors=BLUE, linewidths=0.9))
+    axes.plot(*moved.T, ".", color=BLUE, markersize=3.0)
     x, y = ("tan x [mrad]", "tan y [mrad]") if result.in_angles else ("detector x [mm]", "detector y [mm]")
     axes.set(aspect="equal", xlabel=x, ylabel=y)
     axes.autoscale_view()

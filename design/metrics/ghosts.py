@@ -53,6 +53,9 @@ _LEAST_OF_GHOST = 10
 _CORE = 0.98
 #: Cells across the map of all ghosts.
 _MAP = 160
+#: Rays of a ghost in each cell of the map, at least: fewer are spread over the cells about it, as a large ghost on a
+#: small detector would be single rays.
+_MAP_RAYS = 10
 #: Field of the star where none is given, over the radius of the field of view.
 _FIELD = 0.5
 #: Fraction of the light that a detector reflects, where none is given.
@@ -111,7 +114,8 @@ class Ghosts(FieldResult):
     star : ndarray, shape [2]
         Position of the direct image, x and y of the detector [m].
     irradiance : ndarray, shape [n, n]
-        Irradiance of all ghosts together over the light of the direct image [1/m^2], [y, x].
+        Irradiance of all ghosts together over the light of the direct image [1/m^2], [y, x]; of large ones a mean over
+        so much of the detector as ten rays need.
     edges : ndarray, shape [n + 1]
         Edges of the cells along either axis [m].
     image_radius : float
@@ -317,8 +321,8 @@ def ghosts(
     )
     edges = np.linspace(-1.1 * radius, 1.1 * radius, _MAP + 1)
     irradiance = np.zeros((_MAP, _MAP))
-    for landing in lit:
-        irradiance += _irradiance(landing, edges, edges) / direct
+    for landing, ghost in zip(lit, measured_ghosts, strict=True):
+        irradiance += _on_map(landing, edges, ghost.diameter) / direct
     return Ghosts(
         request=request,
         detector_reflectivity=float(reflecting.detector),
@@ -358,6 +362,20 @@ def _measure(landing: GhostLight, direct: float) -> Ghost:
         irradiance=irradiance,
         edges=edges,
     )
+
+
+def _on_map(landing: GhostLight, edges: np.ndarray, diameter: float) -> np.ndarray:
+    """Return the light per area of a ghost of a diameter [m] in the cells of the map, mean over some of them."""
+    cell = float(edges[1] - edges[0])
+    # Rays in each cell, on average.
+    density = len(landing.weight) * cell**2 / max(0.25 * np.pi * diameter**2, cell**2)
+    beside = min(int(np.ceil(0.5 * (np.sqrt(_MAP_RAYS / density) - 1.0))), len(edges) - 1)
+    if beside <= 0:
+        return _irradiance(landing, edges, edges)
+    # Light beside the map counts in the means at its edge.
+    wider = edges[0] + cell * np.arange(-beside, len(edges) + beside)
+    mean: np.ndarray = uniform_filter(_irradiance(landing, wider, wider), 2 * beside + 1, mode="constant")
+    return mean[beside:-beside, beside:-beside]
 
 
 def _irradiance(landing: GhostLight, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -20,6 +20,8 @@ from .jacobian import ParameterColumns
 OPERANDS: dict[str, type[GoalOperand]] = {}
 #: Units that numbers are shown in, by their unit in SI.
 _MESSAGE_UNITS = {"m": ("mm", 1e-3), "rad": ("deg", float(np.deg2rad(1.0)))}
+#: Unit of ratios in percent, with its size.
+PERCENT = ("percent", 0.01)
 #: Fields of the goal, and of how it is computed; the others say which number it is.
 _GOAL = ("value", "minimum", "maximum", "weight", "step")
 _Kind = TypeVar("_Kind", bound="type[GoalOperand]")
@@ -56,6 +58,8 @@ class Operand:
 
     kind: ClassVar[str] = ""
     unit: ClassVar[str] = ""
+    #: Whether the number, a ratio, is shown and stored in percent.
+    in_percent: ClassVar[bool] = False
 
     value: float | None
     minimum: float | None
@@ -81,10 +85,10 @@ class Operand:
         if self.weight <= 0:
             raise DomainError(f"operand {self.label}: weight = {self.weight!r}: expected a positive number")
         if self.minimum is not None and self.maximum is not None and not self.minimum < self.maximum:
-            size = 1.0 if self.stated is None else self.stated.size
+            unit, size = self.shown_unit
+            low, high = (f"{limit / size:g} {unit}".rstrip() for limit in (self.minimum, self.maximum))
             raise DomainError(
-                f"operand {self.label}: minimum = {self.minimum / size:g}, maximum = {self.maximum / size:g}: "
-                "expected the minimum below the maximum"
+                f"operand {self.label}: minimum = {low}, maximum = {high}: expected the minimum below the maximum"
             )
 
     @property
@@ -110,10 +114,17 @@ class Operand:
 
     @property
     def shown_unit(self) -> tuple[str, float]:
-        """Unit that the number is shown in, and its size in SI: the stated one, or mm and degrees."""
+        """Unit that the number is shown in, and its size in SI: the stated one, or mm, degrees and percent."""
         if self.stated is not None:
             return self.stated.unit, self.stated.size
+        if self.in_percent:
+            return PERCENT
         return _MESSAGE_UNITS.get(self.unit, ("" if self.unit == "1" else self.unit, 1.0))
+
+    @property
+    def stored_unit(self) -> tuple[str, float]:
+        """Unit that the number is stored in, and its size in SI: that of SI, or percent."""
+        return PERCENT if self.in_percent else (self.unit, 1.0)
 
     @property
     def message_goal(self) -> str:

@@ -24,7 +24,7 @@ from .geometry_operands import (
     TotalTrack,
 )
 from .image_operands import Contrast, FieldFocus, PathDifference, TransverseAberration
-from .operand import OPERANDS, GoalOperand, StatedName
+from .operand import OPERANDS, PERCENT, GoalOperand, StatedName
 from .paraxial_operands import (
     AngularMagnification,
     AxialColor,
@@ -67,8 +67,6 @@ class OperandName:
         Fields of the class that the name implies.
     target : {"value", "minimum", "maximum"}
         What a target is.
-    percent : bool
-        Whether the number is in percent.
     """
 
     name: str
@@ -76,12 +74,11 @@ class OperandName:
     definition: str
     implied: Mapping[str, str | None] = field(default_factory=dict)
     target: Literal["value", "minimum", "maximum"] = "value"
-    percent: bool = False
 
     @property
     def units(self) -> dict[str, float]:
         """Units of the number in files with their sizes, the usual one first."""
-        return {"percent": 0.01} if self.percent else NAMED_UNITS[self.kind.unit]
+        return dict([PERCENT]) if self.kind.in_percent else NAMED_UNITS[self.kind.unit]
 
     @property
     def unit(self) -> str:
@@ -149,7 +146,7 @@ _LISTED = [
     OperandName("ASTI", SeidelWavefront, "third-order astigmatism W222", {"aberration": "astigmatism"}),
     OperandName("FCUR", SeidelWavefront, "third-order field curvature W220P (Petzval)", {"aberration": "Petzval"}),
     OperandName("DIST", SeidelWavefront, "third-order distortion W311", {"aberration": "distortion"}),
-    OperandName("DISG", RelativeDistortion, "distortion of the real chief ray against f tan(theta)", percent=True),
+    OperandName("DISG", RelativeDistortion, "distortion of the real chief ray against f tan(theta)"),
     OperandName("AXCL", AxialColor, "axial colour: paraxial focus of the first less that of the second wavelength"),
     OperandName(
         "LACL", ParaxialLateralColor, "lateral colour: paraxial chief ray on the image, first less second wavelength"

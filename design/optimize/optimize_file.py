@@ -45,7 +45,7 @@ from ...models.telescope import Telescope
 from ...raytrace.rays import Projection
 from .configuration import DesignConfiguration
 from .merit_function import SpotSize, WavefrontError
-from .operand import OPERANDS, GoalOperand, Operand
+from .operand import OPERANDS, PERCENT, GoalOperand, Operand
 from .operand_names import NAMES, OperandName, entry_fields, goal_of, unknown_operand
 from .solver import LeastSquares
 
@@ -60,7 +60,7 @@ _KEYS = {
     "angle": ("angle_deg", _DEGREE),
 }
 #: Units at the end of kinds, by the unit of the number.
-_UNITS = {"m": LENGTHS, "rad": ANGLES, "1": {"": 1.0, "percent": 0.01}}
+_UNITS = {"m": LENGTHS, "rad": ANGLES, "1": {"": 1.0, **dict([PERCENT])}}
 
 Pair = tuple[Real, Real]
 Pairs = Annotated[tuple[Pair, ...], Field(min_length=1)]

@@ -62,6 +62,20 @@ class OperandChange(Values):
         """Whether the number after is the wanted value, or within the limits."""
         return abs(self.deviation) <= self.allowed
 
+    def stored(self) -> dict[str, Any]:
+        """Return the operand as it is stored: in SI, ratios that are named percentages in percent."""
+        unit, size = self.operand.stored_unit
+        return {
+            "operand": self.operand.label,
+            "configuration": self.configuration,
+            "unit": unit,
+            "goal": self.operand.goal_text(size),
+            "start": self.start / size,
+            "end": self.end / size,
+            "deviation": self.deviation / size,
+            "holds": self.holds,
+        }
+
 
 @dataclass(frozen=True)
 class Optimum(Result):
@@ -199,19 +213,7 @@ class Optimum(Result):
             "changes": self.changes,
             "uncertainty": self.uncertainty,
             f"effect_{self._unit}_per_unit": self.effect,
-            "operands": [
-                {
-                    "operand": change.operand.label,
-                    "configuration": change.configuration,
-                    "unit": change.operand.unit,
-                    "goal": change.goal,
-                    "start": change.start,
-                    "end": change.end,
-                    "deviation": change.deviation,
-                    "holds": change.holds,
-                }
-                for change in self.operands
-            ],
+            "operands": [change.stored() for change in self.operands],
             "operands_not_held": [change.operand.label for change in self.operands_not_held],
             "collinear": list(self.collinear),
             "message": self.message,

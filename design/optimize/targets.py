@@ -209,8 +209,10 @@ class RelativeDistortion(_ExactOperand):
     wavelength : float, optional
         Vacuum wavelength [m]; the telescope's own by default.
     value, minimum, maximum, weight : float
-        As in :class:`~.operand.Operand`; pure numbers, 0.01 is one per cent.
+        As in :class:`~.operand.Operand`; pure numbers, 0.01 is one per cent. Tables and files have percent.
     """
+
+    in_percent: ClassVar[bool] = True
 
     field: tuple[float, float]
     wavelength: float | None = None

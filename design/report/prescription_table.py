@@ -15,6 +15,7 @@ import numpy as np
 
 from ...core.errors import DomainError, PachonError
 from ...core.units import ARCSEC
+from ...models.central_obscuration import central_obscuration
 from ...models.first_order import first_order, seidel_sums
 from ...models.media.medium import ConstantIndex
 from ...models.parabasal import parabasal_optics
@@ -102,10 +103,11 @@ def first_order_rows(telescope: Telescope, wavelength: float) -> list[tuple[str,
         return f"{value / unit:.8g} {name}" if math.isfinite(value) else "at infinity"
 
     low, high = telescope.band or telescope.wavelength_range
+    pupil = f"diameter {text(telescope.pupil_diameter)}, obscuration {central_obscuration(telescope):.5g}"
     rows = [
         ("wavelength", f"{wavelength * 1e9:.6g} nm; band {low * 1e9:.6g} to {high * 1e9:.6g} nm"),
         ("field of view", f"radius {math.degrees(telescope.field_radius):.6g}°"),
-        ("entrance pupil", f"diameter {text(telescope.pupil_diameter)}, obscuration {telescope.pupil_obscuration:.5g}"),
+        ("entrance pupil", pupil),
     ]
     if math.isfinite(telescope.object_distance):
         rows.append(("object", f"{text(telescope.object_distance - telescope.stop_z)} from the entrance pupil"))

@@ -109,7 +109,7 @@ class MonteCarlo(Result):
             units=units[:count],
             compensator_units=units[count:],
             deviations=deviations,
-            moves=toleranced.moves(deviations),
+            moves=(toleranced.quadratic_moves if method == "quadratic" else toleranced.moves)(deviations),
             merit=traced,
             nominal=nominal,
             contribution=toleranced.contribution,
@@ -123,11 +123,13 @@ class MonteCarlo(Result):
 
     @check_arguments
     def at_most(self, fraction: float) -> float:
-        """Return the merit that a fraction (0 to 1) of the telescopes reaches, in SI; lost ones are worst."""
-        lost = np.isnan(self.merit)
-        if self.criterion.larger:
-            return float(np.quantile(np.where(lost, -np.inf, self.merit), 1.0 - fraction, method="lower"))
-        return float(np.quantile(np.where(lost, np.inf, self.merit), fraction, method="higher"))
+        """Return the merit that at least a fraction (0 to 1) of the telescopes reaches, in SI; lost ones are worst.
+
+        It is that of a telescope: of ten, nine are at most at the merit of 0.9.
+        """
+        sign = -1.0 if self.criterion.larger else 1.0
+        merit = np.where(np.isnan(self.merit), np.inf, sign * self.merit)
+        return sign * float(np.quantile(merit, fraction, method="inverted_cdf"))
 
     @check_arguments
     def yield_at(self, requirement: float) -> Yield:

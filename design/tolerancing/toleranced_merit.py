@@ -18,6 +18,8 @@ from .criterion import Criterion
 
 #: Steps of the differences of gradients, in standard deviations of the tolerances.
 _STEP = 0.5
+#: Relative curvature along combinations of compensators below which they have no effect.
+_FLAT = 1e-9
 
 
 @dataclass(frozen=True)
@@ -138,20 +140,27 @@ class TolerancedMerit:
         g, c, h = gradient[:n], gradient[n:], hessian[:n, :n]
         if self.compensators:
             # The minimum over the compensators is quadratic too (Schur's complement).
-            across, inverse = hessian[:n, n:], np.linalg.inv(hessian[n:, n:])
+            across, inverse = hessian[:n, n:], _scaled_inverse(hessian[n:, n:])
             start = start - 0.5 * float(c @ inverse @ c)
             g, h = g - across @ inverse @ c, h - across @ inverse @ across.T
         square = start + deviations @ g + 0.5 * np.einsum("ni,ij,nj->n", deviations, h, deviations)
         return np.sqrt(np.maximum(square, 0.0))
 
+    def quadratic_moves(self, deviations: np.ndarray) -> np.ndarray:
+        """Return the compensators at the least of :meth:`quadratic` for deviations, shape [n, n_compensator]."""
+        _, gradient, hessian = self.second_order
+        n = len(self.tolerances)
+        return -(gradient[n:] + deviations @ hessian[:n, n:]) @ _scaled_inverse(hessian[n:, n:])
+
     @cached_property
     def second_order(self) -> tuple[float, np.ndarray, np.ndarray]:
         """Square of the merit [m^2], its gradient, and its second derivatives by differences of exact gradients.
 
-        Deviations come first, then compensators; the latter have steps as large as their usual moves.
+        Deviations come first, then compensators; the latter have steps of the effect of all deviations together. Their
+        usual moves are none, where by symmetry they do not respond to deviations to first order.
         """
-        usual = np.sqrt(np.maximum(((self.setting @ self.by_draw) ** 2) @ self.spreads**2, 0.0))
-        steps = _STEP * np.concatenate([self.spreads, np.where(usual > 0, usual, 1.0)])
+        effect = np.linalg.norm(np.append(self.by_draw * self.spreads, self.residuals[:, None], axis=1))
+        steps = _STEP * np.append(self.spreads, effect / np.linalg.norm(self.by_free, axis=0))
         hessian = np.empty((len(steps), len(steps)))
         for i, step in enumerate(steps):
             ends = [self._gradient(sign * step * np.eye(len(steps))[i]) for sign in (1.0, -1.0)]
@@ -188,6 +197,13 @@ class TolerancedMerit:
     def traced_nominal(self) -> float:
         """Criterion of the telescope as designed, compensated to first order, in SI."""
         return self.traced(self.compensated(np.zeros((1, len(self.tolerances))))[0])
+
+
+def _scaled_inverse(hessian: np.ndarray) -> np.ndarray:
+    """Return the inverse of second derivatives by compensators, in each its own unit; without flat combinations."""
+    scale = np.sqrt(np.abs(np.diag(hessian)))
+    inverse: np.ndarray = np.linalg.pinv(hessian / np.outer(scale, scale), rcond=_FLAT, hermitian=True)
+    return inverse / np.outer(scale, scale)
 
 
 def _settings(slopes: np.ndarray, names: tuple[str, ...], least: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from ...core.errors import DomainError, PachonError
 from ...core.number_text import CellText, NumberText
 from ...core.units import ARCSEC
 from ...models.aperture import Annulus, Circle, Complement
+from ...models.central_obscuration import central_obscuration
 from ...models.design_data import LENGTH_UNITS
 from ...models.first_order import first_order
 from ...models.io.yaml.apertures import aperture_items
@@ -78,7 +79,7 @@ def describe(telescope: Telescope) -> dict[str, Any]:
             }
         # What lies at infinity has no number in JSON.
         first = {key: value if value is None or math.isfinite(value) else None for key, value in first.items()}
-    wavelength = telescope.default_wavelength
+    wavelength, obscuration = telescope.default_wavelength, central_obscuration(telescope)
     low, high = telescope.band or telescope.wavelength_range
     centred = any(value is not None for value in first.values())
     heights = axial_heights(telescope)
@@ -93,8 +94,8 @@ def describe(telescope: Telescope) -> dict[str, Any]:
         "folds": folds,
         "parabasal": None if centred else _parabasal(telescope),
         "pupil_diameter_m": telescope.pupil_diameter,
-        "pupil_obscuration": telescope.pupil_obscuration,
-        "effective_area_m2": 0.25 * math.pi * telescope.pupil_diameter**2 * (1.0 - telescope.pupil_obscuration**2),
+        "pupil_obscuration": obscuration,
+        "effective_area_m2": 0.25 * math.pi * telescope.pupil_diameter**2 * (1.0 - obscuration**2),
         "entrance_pupil_z_m": telescope.stop_z,
         "entrance_pupil_center_m": list(telescope.pupil_center),
         "field_radius_deg": math.degrees(telescope.field_radius),

@@ -52,6 +52,11 @@ def folded(telescope, place, z, normal, *, reversed_frames=False):
     return replace(telescope, surfaces=(*telescope.surfaces[:place], fold, *moved))
 
 
+@pytest.fixture
+def auxtel_moved():
+    return pachon.load_telescope("auxtel").perturbed("Detector", shift=(1e-4, 0.0, 0.0))
+
+
 def same(one, other):
     for field in fields(one):
         assert getattr(one, field.name) == pytest.approx(getattr(other, field.name), rel=EXACT, abs=EXACT)
@@ -128,3 +133,33 @@ def test_what_is_off_the_axis_is_refused():
     along = folded(straight, 1, 0.5, (0.0, 1.0, 0.0))
     with pytest.raises(DomainError, match="fold 1 of test: expected a mirror that the axis meets"):
         first_order(along)
+
+
+def test_tilted_windows_behind_a_fold_have_two_focal_lengths(auxtel_moved):
+    """The wedges of LATISS are no surfaces of a centred system, wherever its detector is; parabasal rays serve."""
+    with pytest.raises(DomainError, match=r"L1_entrance.*on the axis behind the folds; parabasal_optics serves"):
+        first_order(auxtel_moved)
+    # Chief rays of close fields, in the plane of the fold and across it.
+    step, telescope = 1e-6, auxtel_moved
+    lengths = []
+    for field in ((0.0, step), (step, 0.0)):
+        ends = []
+        for sign in (1.0, -1.0):
+            rays = pachon.launch_rays(telescope, tuple(sign * f for f in field), 620e-9, pupil=([0.0], [0.0]))
+            ends.append(pachon.trace(telescope, rays))
+        x, y = (telescope.surfaces[-1].to_local(end.position[0])[:2] for end in ends)
+        lengths.append(np.hypot(*(x - y)) / (2.0 * np.tan(step)))
+    # The detector is 0.1 mm from the foci, and the exit pupil 4.4 m from it.
+    assert pachon.models.parabasal_optics(telescope, 620e-9).focal_length == pytest.approx(lengths, rel=2e-4)
+
+
+@pytest.mark.parametrize("folds", [False, True])
+def test_a_plane_across_the_axis_may_be_moved_in_itself(folds):
+    rows = [(0.0, 4.0, -1.0, None), (1.0, np.inf, 0.0, 1.5), (1.1, np.inf, 0.0, 1.0)]
+    plain = telescope_of(rows, stop_z=0.5, diameter=0.4)
+    telescope = folded(plain, 1, 0.5, (0.0, 1.0, 1.0)) if folds else plain
+    # The light behind the fold travels along y.
+    moved = telescope.perturbed("s1", shift=(0.01, 0.0, 0.0)).perturbed("s2", shift=(0.0, 0.0, 0.02 if folds else 0.0))
+    same(first_order(moved), first_order(telescope))
+    with pytest.raises(DomainError, match="s1 of test: expected one on the axis"):
+        first_order(telescope.perturbed("s1", tilt=(1e-6, 0.0, 0.0)))

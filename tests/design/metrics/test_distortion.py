@@ -93,3 +93,12 @@ def test_bad_input_is_refused(lsst_r):
         distortion(lsst_r, reference="spot")
     with pytest.raises(DomainError, match="across = 4: expected an odd"):
         field_lattice(lsst_r, 4)
+
+
+def test_shifts_of_fields_off_any_lattice_are_lines_from_where_they_are_predicted(lsst_r):
+    result = distortion(lsst_r, np.deg2rad([[0.0, 0.0], [1.0, 0.3], [-0.5, 1.1], [0.2, -1.3]]))
+    (lines,) = result.plot().axes[0].collections
+    start, end = np.moveaxis(np.array(lines.get_segments()), 1, 0)
+    assert start == pytest.approx(1e3 * result.predicted)
+    drawn = (end - start) / (1e3 * result.shift)
+    assert drawn == pytest.approx(np.full_like(drawn, drawn[0, 0]))

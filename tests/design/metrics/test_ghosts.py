@@ -125,6 +125,17 @@ def test_ghosts_by_the_detector(with_plate):
     assert back.focus == pytest.approx(-2.0 * way, rel=3e-3)
 
 
+def test_the_map_of_a_ghost_far_larger_than_the_field_is_even(with_plate):
+    """An even disc: fewer than one ray falls into ten cells of the map."""
+    small = replace(with_plate, field_radius=1e-3)
+    found = ghosts(small, (0.0, 0.0), reflectivity=Reflectivity({"front": 0.0, "back": 0.01}, 0.2))
+    way = with_plate.surfaces[3].vertex[2] - with_plate.surfaces[2].vertex[2]
+    disc = 0.25 * np.pi * (2.0 * way / F_NUMBER) ** 2
+    # Three standard deviations of ten rays at random.
+    assert found.irradiance == pytest.approx(np.full_like(found.irradiance, 0.2 * 0.01 / disc), rel=1.0)
+    assert found.irradiance.mean() == pytest.approx(0.2 * 0.01 / disc, rel=0.02)
+
+
 def test_only_the_brightest(with_plate):
     everything = ghosts(with_plate, (0.0, 0.0), n_pupil=4000)
     assert len(everything.ghosts) == 3

@@ -172,7 +172,7 @@ def test_operands_have_names_and_kinds():
         (
             lambda: pachon.design.EdgeThickness("S1", minimum=2e-3, maximum=1e-3),
             DomainError,
-            r"minimum = 0.002, maximum = 0.001",
+            r"minimum = 2 mm, maximum = 1 mm",
         ),
         (lambda: pachon.design.FNumber(np.nan), DomainError, "finite"),
         (lambda: pachon.design.FNumber(3.0, weight=-1.0), DomainError, "weight"),

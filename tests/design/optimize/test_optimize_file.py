@@ -1,9 +1,12 @@
 """Files of optimisations: operands with units, configurations, and what is wrong in one line."""
 
+import re
+
 import numpy as np
 import pytest
 
 import pachon
+from pachon.commands.cli import main
 from pachon.core.errors import PachonError
 from pachon.design.optimize.optimize import optimize
 from pachon.design.optimize.optimize_file import OptimizeFile, catalogue_of, load_optimization, optimization_arguments
@@ -136,3 +139,33 @@ def test_the_catalogue_of_glasses(tmp_path):
     ):
         with pytest.raises(pachon.PachonError, match=words):
             catalogue(**content)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["distortion_percent", "DISG"])
+def test_a_distortion_is_shown_and_stored_in_percent(arguments, triplet, tmp_path, capsys, kind):
+    """The percentage is that of `pachon field-curvature`, whose scale is that of two slopes near the axis."""
+    text = f"""
+        variables: [S7.thickness]
+        fields_deg: [[0, 0], [0, 8]]
+        operands: [{{kind: {kind}, field_deg: [0, 8], min: -0.5, max: 0.5}}]
+        max_steps: 1
+        """
+    (change,) = optimize(**arguments(text)).operands
+    percent = pachon.field_curvature(triplet.with_design(aiming="real"), [[0.0, np.deg2rad(8.0)]]).distortion[0, 1]
+    assert change.start == pytest.approx(0.01 * percent, rel=1e-4)
+    stored = change.stored()
+    assert (stored["unit"], stored["goal"]) == ("percent", ">= -0.5, <= 0.5")
+    assert stored["start"] == pytest.approx(percent, rel=1e-4)
+    command = ["optimize", LENS, "--config", str(tmp_path / "opt.yaml"), "--no-picture", "-o", str(tmp_path / "o.yaml")]
+    assert main(command) == 0
+    line = re.search(r"\(0 8 deg\): (\S+) -> \S+ percent \(>= -0.5, <= 0.5\)", capsys.readouterr().out)
+    assert float(line[1]) == pytest.approx(percent, rel=1e-4)
+    assert main(["operands", LENS, "--operand", f"{kind} field_deg=0,8"]) == 0
+    assert "percent" in capsys.readouterr().out
+
+
+def test_limits_that_contradict_are_shown_in_their_unit(arguments):
+    text = "{variables: [S1.radius], operands: [{kind: distortion_percent, field_deg: [0, 8], min: 2, max: 1}]}"
+    with pytest.raises(PachonError, match="minimum = 2 percent, maximum = 1 percent"):
+        arguments(text)

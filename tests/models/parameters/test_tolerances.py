@@ -10,9 +10,13 @@ import pytest
 import pachon
 from pachon.core.errors import ConfigError, DomainError, PachonError, UnknownNameError
 from pachon.core.files import json_text
+from pachon.design.optimize.merit import Beams
 from pachon.design.optimize.optimize import optimize
+from pachon.design.tolerancing.criterion import Criterion
 from pachon.design.tolerancing.monte_carlo import monte_carlo
+from pachon.design.tolerancing.toleranced_merit import TolerancedMerit
 from pachon.models.io.grid_file import write_grid
+from pachon.models.parameters.degrees_of_freedom import DegreesOfFreedom
 from pachon.models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
 from pachon.models.parameters.tolerances import Tolerance, draw
 from pachon.models.shapes.grid import GridSag
@@ -239,3 +243,47 @@ def test_the_page_runs(tmp_path, monkeypatch, capsys):
     (tmp_path / "modes.yaml").write_text(example)
     dof = pachon.load_degrees_of_freedom(tmp_path / "modes.yaml")
     assert dof.apply(names["telescope"], np.ones(4)) != names["telescope"]
+
+
+@pytest.mark.parametrize("merit", ["wavefront", "spots"])
+@pytest.mark.parametrize(
+    ("tolerances", "compensators"),
+    [
+        # By symmetry the focus does not respond to a decentre, nor a tilt to a focus, to first order.
+        ([Tolerance("M2.dx", 1e-3)], ["Camera.dz"]),
+        ([Tolerance("M2.dx", 1e-3)], ["Camera.rx"]),
+        ([Tolerance("M2.dz", 1e-4)], ["Camera.rx", "Camera.dz"]),
+    ],
+)
+def test_quadratic_merit_where_compensators_do_not_respond_to_first_order(lsst_r, merit, tolerances, compensators):
+    request = pachon.Request.of(lsst_r, [[0.0, 0.0]], n_pupil=4)
+    traced, quadratic = (
+        monte_carlo(request, tolerances, merit, 4, 3, compensators=compensators, method=method).merit
+        for method in ("traced", "quadratic")
+    )
+    # Terms of third order in deviations of a millimetre.
+    assert quadratic == pytest.approx(traced, rel=1e-3)
+
+
+def test_quadratic_compensators_are_at_the_least_of_the_quadratic(lsst_r):
+    request = pachon.Request.of(lsst_r, FIELDS, n_pupil=4)
+    tolerances = (Tolerance("M2.dz", 3e-4), Tolerance("M2.rx", 1e-3))
+    compensators = ("Camera.dz", "Camera.rx")
+    result = monte_carlo(request, tolerances, n=3, seed=3, compensators=compensators, method="quadratic")
+    beams = Beams.of(request)
+    names = [*(t.name for t in tolerances), *compensators]
+    merit = TolerancedMerit.of(
+        lsst_r,
+        tolerances,
+        compensators,
+        DegreesOfFreedom.of_parameters(lsst_r, names),
+        Criterion.of("wavefront", lsst_r, beams),
+    )
+    start, gradient, hessian = merit.second_order
+    for deviations, moves, value in zip(result.deviations, result.moves, result.merit, strict=True):
+        place = np.concatenate([deviations, moves])
+        square = start + gradient @ place + 0.5 * place @ hessian @ place
+        assert np.sqrt(square) == pytest.approx(value, rel=1e-9)
+        slope = (gradient + hessian @ place)[2:]
+        # Rounding of terms that cancel.
+        assert np.all(np.abs(slope) < 1e-9 * np.abs(hessian[2:] * place).sum(axis=1))

@@ -1,9 +1,13 @@
 """Sweeps of a telescope without a camera: metrics against the functions they stand for, compensators, bad input."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import yaml
 
 import pachon
+from pachon.commands.cli import main
 from pachon.core.errors import PachonError
 from pachon.models.paraxial import following_pupil
 from pachon.studies.metrics.telescope import TELESCOPE_METRICS, TelescopeScene
@@ -74,9 +78,9 @@ def test_metrics_of_images():
     lens = pachon.load_telescope(LENS)
     fields, waves = np.deg2rad(FIELDS), np.array([587.6e-9])
     scene = TelescopeScene(lens, fields, waves)
-    found = {
-        key: value for name in ("ee80", "mtf", "throughput") for key, value in TELESCOPE_METRICS[name](scene).items()
-    }
+    found = {}
+    for name in ("ee80", "mtf", "throughput"):
+        found |= TELESCOPE_METRICS[name].compute(scene)
     radii = (
         pachon.encircled_energy(pachon.fft_psf(lens, fields, waves, pixels=128, n_pupil=256)).radius_holding(0.8) * 1e6
     )
@@ -121,3 +125,22 @@ def test_points_that_fail_are_among_those_that_are_counted(tmp_path):
         told = summary(table, store.sweep)
     assert (told["points"], told["failed"]) == (2, 1)
     assert "1 of 2 points could not be computed." in verdict(told)
+
+
+def test_a_sweep_without_a_computed_point_fails(tmp_path, capsys):
+    """At 5 m beside the axis no light meets the surface; the store stays, and says why."""
+    content = {
+        **CONTENT,
+        "base": {"telescope": str(Path(LENS).resolve())},
+        "parameters": {"S3.dy_um": {"nominal": 5e6, "values": [5.1e6]}},
+        "metrics": ["spots"],
+    }
+    (tmp_path / "lens.yaml").write_text(yaml.safe_dump(content))
+    assert main(["sweep", str(tmp_path / "lens.yaml"), "--processes", "1", "--json"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.splitlines()[-1].endswith(
+        "lens.sweep: no point can be computed; point 0: field = (0, 0) deg: the chief ray does not reach the detector"
+    )
+    with SweepStore(tmp_path / "lens.sweep") as store:
+        assert all(result.problem for result in store.results())

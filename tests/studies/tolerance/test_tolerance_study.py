@@ -83,7 +83,10 @@ def test_offenders_and_quantiles(study):
     order = study.offenders
     assert np.all(np.diff(study.cost[order]) <= 0)
     assert study.at_most(1.0) == study.merit.max()
-    assert study.yield_at(study.at_most(0.8)).fraction == pytest.approx(0.8, abs=1 / 30)
+    # Of 30 telescopes, 24 are 80 %, and 29 the first that are at least 95 %.
+    ordered = np.sort(study.merit)
+    assert [study.at_most(f) for f in (0.5, 0.8, 0.95)] == [ordered[14], ordered[23], ordered[28]]
+    assert study.yield_at(study.at_most(0.8)).fraction == 0.8
     requirement = study.yield_at(study.requirement)
     assert study.requirement == pytest.approx(6.4e-6)
     assert requirement.fraction == np.mean(study.merit <= 6.4e-6)
@@ -188,7 +191,8 @@ def test_other_merits(triplet, merit):
         assert found.nominal == pytest.approx(np.mean(rows), abs=0.05)
         assert found.criterion.larger
         assert found.cost[0] > 0
-        assert found.at_most(1.0) == found.merit.min()
+        ordered = np.sort(found.merit)[::-1]
+        assert [found.at_most(k / len(ordered)) for k in (1, 2, len(ordered))] == [*ordered[:2], ordered[-1]]
     assert tolerance_summary(found)["merit"] == merit
 
 
