@@ -25,7 +25,8 @@ class DonutFlag(IntFlag):
     ``NOT_FINITE``: pixels that are saturated or not finite are the reason why the remaining ones have no result.
     ``DEFOCUS_SIGN``: the image fits the other side of focus better. ``OUTSIDE_FIELD``: the telescope does not cover the
     field. ``NO_LIGHT``: no light passes the telescope there, or the chief ray does not reach a CCD.
-    ``TOO_FEW_PHOTONS``: fewer photons than unknowns. ``NOT_CONVERGED``: the fit did not converge.
+    ``TOO_FEW_PHOTONS``: fewer photons than unknowns. ``NOT_CONVERGED``: the fit did not converge. ``INTERRUPTED``:
+    Ctrl-C came before the fit.
     """
 
     OK = 0
@@ -47,6 +48,7 @@ class DonutFlag(IntFlag):
     MOSTLY_LOST = 32768
     ORIENTATION = 65536
     AMPLIFIER_STEP = 131072
+    INTERRUPTED = 262144
 
     @property
     def usable(self) -> bool:
