@@ -16,6 +16,8 @@ from ..core.threads import thread_count
 from ..core.units import pure_numbers, require_positive
 from ..models.camera.photometry import DARK_CURRENT, FULL_WELL, PIXEL_SCALE, READ_NOISE, Band, BandName
 from ..pipeline.experiment import Experiment
+from ..pipeline.sensor.brighter_fatter import SensorVendor, boundary_shifts
+from ..pipeline.sensor.pixel_boundaries import collect, with_rim, without_rim
 from ..pipeline.simulate.photometry import band_named, sky_electrons_per_pixel
 
 #: Bit of the mask of a pixel that reaches the full well.
@@ -26,6 +28,8 @@ MASK_BITS = {SATURATED: "SATURATED"}
 _MOST_MAGNITUDES = 100.0
 #: Rows of a band of the image; each band has its own random stream.
 _ROWS = 128
+#: Rows beside a band whose charge counts for that collected in it: the spline of the charge falls by 0.43 a row.
+_BESIDE = 16
 
 
 @check_arguments
@@ -59,6 +63,8 @@ class Exposure:
         Whether there is noise; without it an image is the expected one.
     photometry : Band, optional
         Zero point, sky and extinction; by default those of the LSST in the band.
+    brighter_fatter : {"itl", "e2v"}, optional
+        Make of the CCD, whose charge moves the boundaries of pixels of 10 um, columns along y; by default it does not.
     """
 
     band: BandName = "r"
@@ -73,6 +79,7 @@ class Exposure:
     subtract_background: bool = True
     noise: bool = True
     photometry: Band | None = None
+    brighter_fatter: SensorVendor | None = None
 
     @classmethod
     def of_run(cls, experiment: Experiment, exposures: int = 1, **settings: Any) -> Exposure:
@@ -84,6 +91,7 @@ class Exposure:
             "read_noise": band.read_noise,
             "dark_current": band.dark_current,
             "full_well": band.full_well,
+            "brighter_fatter": experiment.config.sensor.brighter_fatter,
         }
         return cls(
             band.name, experiment.config.atmosphere.exposure_s, exposures, photometry=band, **(run_values | settings)
@@ -195,7 +203,7 @@ def expose(
 
     def fill(band: int) -> None:
         rows = slice(band * _ROWS, (band + 1) * _ROWS)
-        collected = scene[rows].astype(np.float64) + exposure.background
+        collected = _collected(scene, rows, exposure)
         variance[rows] = (np.maximum(collected, 0.0) + read) / gain**2
         if exposure.noise:
             random = stream(seed, "image noise", *key, band)
@@ -207,3 +215,16 @@ def expose(
     with ThreadPoolExecutor(thread_count(threads)) as pool:
         list(pool.map(fill, range(-(-scene.shape[0] // _ROWS))))
     return ExposedImage(image, variance, mask)
+
+
+def _collected(scene: np.ndarray, rows: slice, exposure: Exposure) -> np.ndarray:
+    """Return the expected charge of sources and background in some rows of a scene, [n_row, nx]."""
+    if exposure.brighter_fatter is None:
+        return scene[rows].astype(np.float64) + exposure.background
+    first = max(rows.start - _BESIDE, 0)
+    light = scene[first : rows.stop + _BESIDE].astype(np.float64) + exposure.background
+    # Boundaries move anew in each exposure, by no more charge than a pixel holds.
+    light = with_rim(light[None])
+    charge = np.minimum(light / exposure.exposures, exposure.full_well)
+    collected = without_rim(collect(light, *boundary_shifts(0.5 * charge, exposure.brighter_fatter)))[0]
+    return np.asarray(collected[rows.start - first : rows.stop - first])
