@@ -48,8 +48,8 @@ _PCA_STARS = 2000
 _EXTRA_NOISE = 1.0
 # Range of reduced chi-square outside of which there is a warning.
 _CHI2 = (0.7, 1.4)
-# CCDs up to which stars may be less likely with the telescope that they were taken with than without any: of the nine of
-# a raft in four of five exposures, by ln ratios of -8 to -16.
+# CCDs up to which stars may be less likely with the telescope that they were taken with than without any: of the nine
+# of a raft in four of five exposures, by ln ratios of -8 to -16.
 _FEW_CCDS = 30
 
 # Where arguments of earlier versions stand.
