@@ -161,7 +161,8 @@ def case_metrics(samples: Sequence[Residuals]) -> dict[str, float]:
         # Mean squares [n_draw, n_ccd]: the draws of a CCD share its PSF, so the CCDs give the error.
         ccd_squares = squares.mean(axis=0)
         result[name] = value = float(np.sqrt(ccd_squares.mean()))
-        error = ccd_squares.std(ddof=1) / np.sqrt(len(ccd_squares)) if len(ccd_squares) > 1 else np.nan
+        enough = len(ccd_squares) >= FEWEST_PATCHES
+        error = ccd_squares.std(ddof=1) / np.sqrt(len(ccd_squares)) if enough else np.nan
         result[f"error_{name}"] = float(0.5 * error / value) if value > 0.0 else np.nan
 
     for k, kind in enumerate(KINDS):
