@@ -65,6 +65,8 @@ class Exposure:
         Zero point, sky and extinction; by default those of the LSST in the band.
     brighter_fatter : {"itl", "e2v"}, optional
         Make of the CCD, whose charge moves the boundaries of pixels of 10 um, columns along y; by default it does not.
+    snaps : int
+        Snaps that each exposure is the sum of: the charge of one moves boundaries.
     """
 
     band: BandName = "r"
@@ -80,6 +82,7 @@ class Exposure:
     noise: bool = True
     photometry: Band | None = None
     brighter_fatter: SensorVendor | None = None
+    snaps: int = 1
 
     @classmethod
     def of_run(cls, experiment: Experiment, exposures: int = 1, **settings: Any) -> Exposure:
@@ -92,6 +95,7 @@ class Exposure:
             "dark_current": band.dark_current,
             "full_well": band.full_well,
             "brighter_fatter": experiment.config.sensor.brighter_fatter,
+            "snaps": experiment.snaps,
         }
         return cls(
             band.name, experiment.config.atmosphere.exposure_s, exposures, photometry=band, **(run_values | settings)
@@ -102,8 +106,9 @@ class Exposure:
             raise DomainError(f"band = {self.band}: expected {self._band.name}, the band of photometry")
         for name in ("time", "gain", "full_well", "pixel_scale"):
             require_positive(getattr(self, name), name)
-        if self.exposures < 1:
-            raise DomainError(f"exposures = {self.exposures}: expected 1 or more")
+        for name in ("exposures", "snaps"):
+            if getattr(self, name) < 1:
+                raise DomainError(f"{name} = {getattr(self, name)}: expected 1 or more")
         for name in ("read_noise", "dark_current"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
                 raise DomainError(f"{name} = {getattr(self, name)}: expected a number that is not negative")
@@ -223,8 +228,8 @@ def _collected(scene: np.ndarray, rows: slice, exposure: Exposure) -> np.ndarray
         return scene[rows].astype(np.float64) + exposure.background
     first = max(rows.start - _BESIDE, 0)
     light = scene[first : rows.stop + _BESIDE].astype(np.float64) + exposure.background
-    # Boundaries move anew in each exposure, by no more charge than a pixel holds.
+    # Boundaries move anew in each snap, by no more charge than a pixel holds.
     light = with_rim(light[None])
-    charge = np.minimum(light / exposure.exposures, exposure.full_well)
+    charge = np.minimum(light / exposure.exposures, exposure.full_well) / exposure.snaps
     collected = without_rim(collect(light, *boundary_shifts(0.5 * charge, exposure.brighter_fatter)))[0]
     return np.asarray(collected[rows.start - first : rows.stop - first])

@@ -7,9 +7,11 @@ import pytest
 
 from pachon.core.errors import ConfigError, DomainError
 from pachon.imaging.exposure import SATURATED, Exposure, expose
-from pachon.pipeline.config import Configuration
+from pachon.pipeline.config import Configuration, ListedVisitConfig
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.sensor.brighter_fatter import brighter_fatter
+from pachon.pipeline.simulate.ccd_observation import collected_images
+from pachon.pipeline.simulate.photometry import sky_electrons_per_pixel
 
 SCENE = np.full((300, 400), 250.0, dtype=np.float32)
 #: Background of 15 s in r: dark sky of 21.2 mag over 0.04 arcsec^2, zero point 28.36 + 0.13, and 0.2 e-/s dark current.
@@ -154,6 +156,26 @@ def test_boundaries_of_pixels_move_anew_in_each_exposure():
     # A pixel that is full repels no more.
     full = expose(1e4 * scene, replace(one, full_well=1e5), 1, "A").image
     assert np.isfinite(full).all()
+
+
+def test_the_charge_of_one_snap_moves_boundaries():
+    """A visit of two snaps has half of the effect of one exposure of the same light, to first order."""
+    scene = gaussians((60, 60), [(30, 30)], [4e5]).astype(np.float32)
+    plain, whole, halves = (
+        expose(scene, Exposure(noise=False, full_well=1e6, **more), 1, "A").image.astype(np.float64)
+        for more in ({}, {"brighter_fatter": "itl"}, {"brighter_fatter": "itl", "snaps": 2})
+    )
+    changes = halves[30, 30] - plain[30, 30], whole[30, 30] - plain[30, 30]
+    assert changes[0] == pytest.approx(0.5 * changes[1], rel=0.02)
+    visit = ListedVisitConfig(number=1, mid_mjd=61000.0, snaps=2)
+    experiment = Experiment.from_config(Configuration(ccds=["R22_S11"], visit=visit, sensor={"brighter_fatter": "itl"}))
+    assert Exposure.of_run(experiment).snaps == 2
+    star = scene[None].astype(np.float64) / 4e5
+    collected = collected_images(experiment, star, 1e-6, np.array([4e5]))[0]
+    sky = sky_electrons_per_pixel(experiment.band, 15.0, 1e-6)
+    # The camera's pixels exchange x and y.
+    expected = brighter_fatter(star.swapaxes(1, 2), np.array([2e5]), sensor="itl", sky=0.5 * sky).swapaxes(1, 2)[0]
+    np.testing.assert_array_equal(collected, expected)
 
 
 def test_the_sensor_of_a_run_is_that_of_its_images():
