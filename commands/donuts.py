@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
@@ -22,7 +23,7 @@ from .donut_options import (
 from .donut_report import observatory_summary, orientation_text, show_fit
 from .donut_simulation import simulate_file
 from .inputs import warnings_shown
-from .interrupt import interruptible
+from .interrupt import InterruptedRunError, interruptible
 from .option_groups import require_defaults, with_option_groups
 from .tables import print_json
 
@@ -81,7 +82,7 @@ def donuts_command(
     if telescope.defocus_um and work.inputs.defocus.any():
         of_files = ", ".join(f"{shift:.4g}" for shift in sorted({1e6 * float(shift) for shift in work.inputs.defocus}))
         print_warning(f"--defocus-um = {telescope.defocus_um:g} is added to the defocus of the files, {of_files} um")
-    fit, orientation = _fitted(work, telescope.quiet, orientation_check=fit_options.orientation_check)
+    fit, orientation, interrupted = _fitted(work, telescope.quiet, orientation_check=fit_options.orientation_check)
     converted = fit.zernikes_in(frames.zernike_convention, frames.names[1], frames=work.frames)
     motions = _hexapod_corrections(fit, frames, work.frames)
     _write(fit, converted, output, kind)
@@ -89,20 +90,36 @@ def donuts_command(
         print_json(fit.summary() | observatory_summary(work.frames, converted, motions, orientation))
     elif not telescope.quiet:
         show_fit(fit, converted, motions)
+    if interrupted:
+        raise InterruptedRunError(_interrupted_text(fit, output.out))
 
 
-def _fitted(work: DonutWork, quiet: bool, *, orientation_check: bool) -> tuple[DonutFit, OrientationCheck | None]:
-    """Fit donuts, check their orientation, and warn of what is wrong with them all."""
+def _fitted(work: DonutWork, quiet: bool, *, orientation_check: bool) -> tuple[DonutFit, OrientationCheck | None, bool]:
+    """Fit donuts, check their orientation, and warn of what is wrong with them all.
+
+    The third value is whether Ctrl-C ended it; the fit has the donuts that were finished then.
+    """
     from ..sensing.flags import DonutFlag
+    from ..sensing.interrupted_fit import InterruptedFitError
 
     count = len(work.inputs.images)
-    with (
-        warnings_shown(PrescriptionWarning),
-        interruptible(quiet, "nothing is written before all donuts are fitted") as reporter,
-        reporter.stage(f"wavefronts of {counted(count, 'donut')}", total=count) as stage,
-    ):
-        fit = work.fit(stage.advance)
-        orientation = work.orientation(fit) if orientation_check else None
+    fit = orientation = None
+    try:
+        with (
+            warnings_shown(PrescriptionWarning),
+            interruptible(quiet, "no donut was finished") as reporter,
+            reporter.stage(f"wavefronts of {counted(count, 'donut')}", total=count) as stage,
+        ):
+            try:
+                fit = work.fit(stage.advance)
+            except InterruptedFitError as stopped:
+                fit = stopped.fit
+                raise
+            orientation = work.orientation(fit) if orientation_check else None
+    except InterruptedRunError:
+        if fit is None:
+            raise
+        return fit, None, True
     if not work.is_defocused(fit):
         print_warning(
             "defocus is 0 um, that of the files and --defocus-um together: stars are fitted as in focus. Of donuts, "
@@ -111,7 +128,15 @@ def _fitted(work: DonutWork, quiet: bool, *, orientation_check: bool) -> tuple[D
     if orientation is not None and orientation.doubtful:
         fit = replace(fit, flags=fit.flags | oriented(fit) * int(DonutFlag.ORIENTATION))
         print_warning(orientation_text(orientation, work.inputs))
-    return fit, orientation
+    return fit, orientation, False
+
+
+def _interrupted_text(fit: DonutFit, out: Path | None) -> str:
+    """Return how many donuts an interrupted fit has, and where they are."""
+    from ..sensing.flags import DonutFlag
+
+    lost = int((fit.flags & int(DonutFlag.INTERRUPTED) > 0).sum())
+    return f"interrupted; {len(fit) - lost} of {counted(len(fit), 'donut')} fitted" + (f", in {out}" if out else "")
 
 
 def _hexapod_corrections(fit: DonutFit, options: FrameOptions, frames: DonutFrames) -> BodyMotions | None:

@@ -14,6 +14,7 @@ from .options import (
     Basis,
     ColourColumn,
     Components,
+    FlagMask,
     Gain,
     Interpolation,
     Json,
@@ -36,6 +37,8 @@ from .tables import Rows, print_json
 from .verdicts import model_verdict
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from ..reconstruction.psf_model.colour import FittedColour
 
 app = typer.Typer()
@@ -53,6 +56,7 @@ def model_command(
     mask: StarMask = None,
     images: StarImages = None,
     colour_column: ColourColumn = None,
+    flag_mask: FlagMask = None,
     size: Annotated[int | None, Option(help="Side of the PSF [pixel], odd; that of the stamps less a rim.")] = None,
     min_snr: MinSnr = 20.0,
     gain: Gain = 1.0,
@@ -80,7 +84,8 @@ def model_command(
     """Model the PSF of an image from a table of its stars, and show how well it predicts stars that were held out.
 
     Stars are centred; pixels without weight, neighbours and cosmic rays apart from a core are masked; stars with
-    saturated cores, or too little that is not masked, are left out. The model is kriging of pixels, as smooth as the
+    saturated cores, or too little that is not masked, and those that a column FLAGS calls blended, saturated, cut or
+    incomplete (`--flag-mask`), are left out. The model is kriging of pixels, as smooth as the
     stars say, or that of the options. It leaves the model, STARS_psf.fits; a picture beside it, .png (with `--json`
     where `--picture` names it); and all stars with their shapes and what the model made without them predicts, .ecsv.
 
@@ -92,13 +97,17 @@ def model_command(
     - `pachon model stars.fits --colour-column g_i`: the PSF may depend on the colours of the stars
     - `pachon model stars.ecsv --images stamps.fits --x X --y Y -o psf.fits`
     """
+    import numpy as np
+
     from ..core.files import write_bytes
     from ..core.plotting import picture_bytes
     from ..core.table_files import in_format_of, write_table
     from ..core.units import ARCSEC
+    from ..measure.star_selection import StarFlag, require_stars
     from ..models.star_spectrum import psf_colours
-    from ..reconstruction.own_stars.own_stars import fit_own_stars
-    from ..reconstruction.own_stars.star_catalogue import load_stars
+    from ..reconstruction.own_stars.own_stars import FEWEST_STARS, fit_own_stars
+    from ..reconstruction.own_stars.result import with_left_out
+    from ..reconstruction.own_stars.star_catalogue import FLAG_MASK, load_stars
 
     kind = picture_kind(picture)
     chosen_recipe = recipe_of_options(recipe, basis, interpolation, components, weights, order)
@@ -108,10 +117,14 @@ def model_command(
         cutouts = load_stars(
             stars, x=x, y=y, stamp=stamp, weight=weight, mask=mask, images=images, colour=colour_column
         )
-        if cutouts.colour is not None:
-            options["colour"] = psf_colours(cutouts.colour, colour_column or "")
-        result = fit_own_stars(
-            *cutouts,
+        bits = FLAG_MASK if flag_mask is None else flag_mask
+        kept = cutouts.unflagged(bits)
+        require_stars(kept, np.where(kept, 0, StarFlag.FLAGGED_IN_CATALOGUE), FEWEST_STARS)
+        fitted = cutouts.part(kept)
+        if fitted.colour is not None:
+            options["colour"] = psf_colours(fitted.colour, colour_column or "")
+        own_stars = fit_own_stars(
+            *fitted,
             pixel_arcsec * ARCSEC,
             size=size,
             min_snr=min_snr,
@@ -120,6 +133,7 @@ def model_command(
             background=background,
             **options,
         )
+        result = with_left_out(own_stars, cutouts.positions, kept)
         result.model.write(path)
         picture_path = picture or (None if as_json else path.with_suffix(".png"))
         if picture_path is not None and not no_picture:
@@ -148,6 +162,8 @@ def model_command(
             *([] if no_picture else [("picture", str(picture_path))]),
             ("stars", str(table or path.with_suffix(".ecsv"))),
         ]
+        if cutouts.flags is not None and not kept.all():
+            rows.insert(3, ("... by its FLAGS", _flags_text(cutouts.flags[~kept] & bits)))
         if colour_column is not None:
             rows.insert(1, ("dependence on colour", _colour_text(colour_column, result.model.colour)))
         Rows(("", ""), rows, left=2, verdict=model_verdict(summary_of_stars)).show()
@@ -156,6 +172,15 @@ def model_command(
 def _percent(figures: dict[str, Any], *keys: str) -> str:
     """Return some figures in per cent."""
     return ", ".join(f"{100 * figures[key]:.2f} %" for key in keys)
+
+
+def _flags_text(flags: np.ndarray) -> str:
+    """Return the words for bits of FLAGS that leave stars out."""
+    from ..reconstruction.own_stars.star_catalogue import FLAG_WORDS
+
+    counts = {words: int(((flags & bit) > 0).sum()) for bit, words in FLAG_WORDS.items()}
+    reasons = ", ".join(f"{n} {words}" for words, n in counts.items() if n)
+    return f"{reasons or 'other bits'}; --flag-mask 0 keeps them"
 
 
 def _colour_text(column: str, colour: FittedColour | None) -> str:

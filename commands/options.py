@@ -116,6 +116,13 @@ StarWeight = Annotated[
 StarMask = Annotated[
     str | None, Option("--mask", help="Column of masks of pixels, 0 where good; MASK, VIGNET_MASK, ... by default.")
 ]
+FlagMask = Annotated[
+    int | None,
+    Option(
+        min=0,
+        help="Bits of a column FLAGS that leave a star out; 254 by default, as PSFEx: all but 1. 0 keeps all stars.",
+    ),
+]
 ColourColumn = Annotated[
     str | None, Option(help="Column of colours of stars, such as g_i; teff [K] counts as g - i of blackbodies.")
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
@@ -132,9 +133,10 @@ def _verdict(result: Study) -> str:
     if best_case is None:
         return f"No model of {base.stars} stars could be fitted."
     metrics = result.metrics[best_case]
+    error = metrics["error_rms_g_away"]
     return (
         f"Recommended for {base.stars} stars of S/N {base.snr:g} and more: {best_case}; residual of g at holdout "
-        f"positions {metrics['rms_g_away']:.2e} ± {metrics['error_rms_g_away']:.0e}."
+        f"positions {metrics['rms_g_away']:.2e}" + (f" ± {error:.0e}." if math.isfinite(error) else ".")
     )
 
 

@@ -16,6 +16,8 @@ from ..core.threads import thread_count
 from ..core.units import pure_numbers, require_positive
 from ..models.camera.photometry import DARK_CURRENT, FULL_WELL, PIXEL_SCALE, READ_NOISE, Band, BandName
 from ..pipeline.experiment import Experiment
+from ..pipeline.sensor.brighter_fatter import SensorVendor, boundary_shifts
+from ..pipeline.sensor.pixel_boundaries import collect, with_rim, without_rim
 from ..pipeline.simulate.photometry import band_named, sky_electrons_per_pixel
 
 #: Bit of the mask of a pixel that reaches the full well.
@@ -26,6 +28,8 @@ MASK_BITS = {SATURATED: "SATURATED"}
 _MOST_MAGNITUDES = 100.0
 #: Rows of a band of the image; each band has its own random stream.
 _ROWS = 128
+#: Rows beside a band whose charge counts for that collected in it: the spline of the charge falls by 0.43 a row.
+_BESIDE = 16
 
 
 @check_arguments
@@ -59,6 +63,10 @@ class Exposure:
         Whether there is noise; without it an image is the expected one.
     photometry : Band, optional
         Zero point, sky and extinction; by default those of the LSST in the band.
+    brighter_fatter : {"itl", "e2v"}, optional
+        Make of the CCD, whose charge moves the boundaries of pixels of 10 um, columns along y; by default it does not.
+    snaps : int
+        Snaps that each exposure is the sum of: the charge of one moves boundaries.
     """
 
     band: BandName = "r"
@@ -73,6 +81,8 @@ class Exposure:
     subtract_background: bool = True
     noise: bool = True
     photometry: Band | None = None
+    brighter_fatter: SensorVendor | None = None
+    snaps: int = 1
 
     @classmethod
     def of_run(cls, experiment: Experiment, exposures: int = 1, **settings: Any) -> Exposure:
@@ -84,6 +94,8 @@ class Exposure:
             "read_noise": band.read_noise,
             "dark_current": band.dark_current,
             "full_well": band.full_well,
+            "brighter_fatter": experiment.config.sensor.brighter_fatter,
+            "snaps": experiment.snaps,
         }
         return cls(
             band.name, experiment.config.atmosphere.exposure_s, exposures, photometry=band, **(run_values | settings)
@@ -94,8 +106,9 @@ class Exposure:
             raise DomainError(f"band = {self.band}: expected {self._band.name}, the band of photometry")
         for name in ("time", "gain", "full_well", "pixel_scale"):
             require_positive(getattr(self, name), name)
-        if self.exposures < 1:
-            raise DomainError(f"exposures = {self.exposures}: expected 1 or more")
+        for name in ("exposures", "snaps"):
+            if getattr(self, name) < 1:
+                raise DomainError(f"{name} = {getattr(self, name)}: expected 1 or more")
         for name in ("read_noise", "dark_current"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
                 raise DomainError(f"{name} = {getattr(self, name)}: expected a number that is not negative")
@@ -195,7 +208,7 @@ def expose(
 
     def fill(band: int) -> None:
         rows = slice(band * _ROWS, (band + 1) * _ROWS)
-        collected = scene[rows].astype(np.float64) + exposure.background
+        collected = _collected(scene, rows, exposure)
         variance[rows] = (np.maximum(collected, 0.0) + read) / gain**2
         if exposure.noise:
             random = stream(seed, "image noise", *key, band)
@@ -207,3 +220,16 @@ def expose(
     with ThreadPoolExecutor(thread_count(threads)) as pool:
         list(pool.map(fill, range(-(-scene.shape[0] // _ROWS))))
     return ExposedImage(image, variance, mask)
+
+
+def _collected(scene: np.ndarray, rows: slice, exposure: Exposure) -> np.ndarray:
+    """Return the expected charge of sources and background in some rows of a scene, [n_row, nx]."""
+    if exposure.brighter_fatter is None:
+        return scene[rows].astype(np.float64) + exposure.background
+    first = max(rows.start - _BESIDE, 0)
+    light = scene[first : rows.stop + _BESIDE].astype(np.float64) + exposure.background
+    # Boundaries move anew in each snap, by no more charge than a pixel holds.
+    light = with_rim(light[None])
+    charge = np.minimum(light / exposure.exposures, exposure.full_well) / exposure.snaps
+    collected = without_rim(collect(light, *boundary_shifts(0.5 * charge, exposure.brighter_fatter)))[0]
+    return np.asarray(collected[rows.start - first : rows.stop - first])

@@ -206,7 +206,7 @@ def draw_ccd(
         experiment.telescope.name,
         config.seed,
         config.atmosphere.epoch,
-        tuple(observation_cards(experiment, ccd)),
+        tuple(observation_cards(experiment, ccd, exposure.total_time)),
     )
 
 

@@ -41,7 +41,8 @@ class StarFlag(IntFlag):
     """Defects of a star; zero for a good one.
 
     ``UNUSABLE``: there is no light to scale the median star to. ``MASKED``: masked pixels hold more than half of the
-    core, or in :func:`~pachon.fit_own_stars` of the weighted light.
+    core, or in :func:`~pachon.fit_own_stars` of the weighted light. ``FLAGGED_IN_CATALOGUE``: left out by ``pachon
+    model`` for its FLAGS.
     """
 
     GOOD = 0
@@ -50,6 +51,7 @@ class StarFlag(IntFlag):
     SATURATED = 4
     UNUSABLE = 8
     MASKED = 16
+    FLAGGED_IN_CATALOGUE = 32
 
 
 @dataclass(frozen=True, eq=False)

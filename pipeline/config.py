@@ -250,7 +250,7 @@ class SensorConfig(Section):
     """Sensor effects on images of stars; all are off by default."""
 
     brighter_fatter: Literal["itl", "e2v"] | None = Field(
-        None, description="make of the CCDs, for the brighter-fatter effect on observed stars"
+        None, description="make of the CCDs, for the brighter-fatter effect on observed stars and images"
     )
     tree_rings_um: NotNegative = Field(0.0, description="largest displacement by tree rings [um]")
     tree_ring_period_um: Positive = Field(600.0, description="distance of the rings [um]")

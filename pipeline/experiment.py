@@ -282,6 +282,11 @@ class Experiment:
         finally:
             self.atmosphere.release()
 
+    @property
+    def snaps(self) -> int:
+        """Snaps that the exposure is the sum of: those of a visit of a list, else 1."""
+        return 1 if self.config.visit is None else self.config.visit.snaps
+
     @cached_property
     def field_radius_on_detector(self) -> float:
         """Distance from the axis at which the edge of the field of view lands on the detector [m]."""

@@ -175,12 +175,12 @@ def visit_cards(experiment: Experiment, ccd: str) -> list[Card]:
     ]
 
 
-def observation_cards(experiment: Experiment, ccd: str) -> list[Card]:
+def observation_cards(experiment: Experiment, ccd: str, exposure: float) -> list[Card]:
     """Return :func:`visit_cards`; without a visit those of instrument and detector, and a nominal date.
 
-    The date is the epoch J2000, at which positions of catalogues need no proper motion.
+    The date is the epoch J2000, at which positions of catalogues need no proper motion, to the middle of an exposure
+    [s], all of a sum together.
     """
-    exposure = experiment.config.atmosphere.exposure_s
     comment = "nominal: of no visit"
     return visit_cards(experiment, ccd) or [
         ("INSTRUME", instrument_of(experiment.camera), "camera"),

@@ -9,7 +9,13 @@ import numpy as np
 
 from ..core.statistics import finite_mean, finite_median, rms
 from ..core.units import ARCMIN, ARCSEC
-from ..measure.correlation import SEPARATION_RANGES, Correlation, SeparationBins, shear_correlation
+from ..measure.correlation import (
+    SEPARATION_RANGES,
+    Correlation,
+    SeparationBins,
+    patches_of_jackknife,
+    shear_correlation,
+)
 from ..measure.rho_statistics import trace_of_moments
 from ..reconstruction.ccd_product import CCD_KINDS, CcdProduct, CcdStars, Stars
 
@@ -36,8 +42,9 @@ def correlations(
 
     Residuals at the stars of an unweighted fit with a constant term sum to zero over each CCD, so their correlation
     between CCDs cancels for any error of the model; those at holdout positions apply to galaxies. Errors are by
-    jackknife over the CCDs where there are two or more. A kind of which fewer than two stars have adaptive moments, as
-    images of the optics alone that are narrower than a pixel, is left out.
+    jackknife over the CCDs where there are :data:`~.FEWEST_PATCHES` or more, else from the scatter of the
+    ellipticities. A kind of which fewer than two stars have adaptive moments, as images of the optics alone that are
+    narrower than a pixel, is left out.
     """
     bins = separation_bins(products)
     if kinds is None:
@@ -51,7 +58,7 @@ def correlations(
             usable = np.isfinite(values).all(axis=0)
             if usable.sum() < 2:
                 continue
-            if patch is not None and np.ptp(patch[usable]) == 0:
+            if patch is not None and patches_of_jackknife(patch[usable]) is None:
                 patch = None
         result[kind] = shear_correlation(x, y, *values, bins=bins, patch=patch)
     return result
@@ -73,8 +80,8 @@ def size_residuals(products: Sequence[CcdStars], kind: str, moments: str = "e") 
 
 
 def patches(stars: Sequence[Stars]) -> np.ndarray | None:
-    """Return the number of the CCD of each star, the patches of a jackknife; None where there is but one CCD."""
-    return np.repeat(np.arange(len(stars)), [len(s) for s in stars]) if len(stars) > 1 else None
+    """Return the number of the CCD of each star, the patches of a jackknife; None where there are too few CCDs."""
+    return patches_of_jackknife(np.repeat(np.arange(len(stars)), [len(s) for s in stars]))
 
 
 def separation_bins(products: Sequence[CcdStars]) -> SeparationBins:

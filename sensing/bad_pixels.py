@@ -9,6 +9,11 @@ from scipy.ndimage import binary_opening, label, maximum_filter, median_filter, 
 
 from .stamps import Pixels, measured_variance
 
+#: Pixels, as a fraction of the stamp, from which on those of one greatest value are saturated, and saturated ones the
+#: reason why there is no result.
+SEVERAL = 0.002
+#: Electrons up to which pixels of equal value are no sign of saturation.
+_FAINT = 100.0
 #: A pixel this many standard deviations off its neighbours is no part of a donut, if it is as far off by contrast, too.
 _SIGMA = 8.0
 #: Least difference of such a pixel from its neighbours over their light.
@@ -44,6 +49,20 @@ def grown(bad: np.ndarray, used: np.ndarray) -> np.ndarray:
     wider = maximum_filter(bad, 3)
     scattered = ~used & ~unused_regions(used)
     return wider if (wider | scattered).mean() < _FEW or wider.sum() < _COMPACT * bad.sum() else bad
+
+
+def saturated_pixels(image: np.ndarray, masked: np.ndarray, level: float | None) -> np.ndarray:
+    """Return the saturated pixels: from a level on, or without one those of the greatest value where many have it.
+
+    Pixels with noise hardly agree unless they are saturated.
+    """
+    if level is not None:
+        high = (image >= level) & ~masked
+        if high.any():
+            return high
+    top = image.max(initial=0.0, where=~masked)
+    plateau = (image == top) & ~masked
+    return plateau if top > _FAINT and plateau.sum() > max(SEVERAL * image.size, 1.0) else np.zeros_like(masked)
 
 
 def without_bad_pixels(pixels: Pixels) -> Pixels:

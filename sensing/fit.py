@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from ..models.telescope import Telescope
 from ..raytrace.rays import Projection
 from ..wavefront.psf.light import Light
 from .amplifier_steps import AmplifierStep, step_table
-from .bad_pixels import grown
+from .bad_pixels import SEVERAL, grown, saturated_pixels
 from .diffraction_vote import DiffractionVote, vote_on_diffraction
 from .fit_star import StarFit, fit_star
 from .flags import DonutFlag
@@ -39,6 +39,7 @@ from .image_model import (
     Y,
 )
 from .inputs import ObservedStar, ObservedStars
+from .interrupted_fit import InterruptedFitError
 from .light import Instrument, StarLight
 from .likelihood import pulls
 from .model import DonutModel
@@ -52,13 +53,8 @@ from .star_fitter import SMALLEST_DONUT, StarSolution
 from .step_search import fit_steps
 from .wavefront_fits import NOLL, FittedStars, SingleDonuts, UsableStars, WavefrontFit
 
-#: Pixels, as a fraction of the stamp, from which on those of one greatest value are saturated, and saturated ones the
-#: reason why there is no result.
-_SEVERAL = 0.002
 #: The same of pixels that are not finite.
 _MOST = 0.5
-#: Electrons up to which pixels of equal value are no sign of saturation.
-_FAINT = 100.0
 #: Chi-square a pixel above which a fit is poor.
 _POOR = 1.2
 #: Standard deviations of the noise's own chi-square that a poor fit has beyond that.
@@ -169,6 +165,8 @@ def fit_donuts(
     DomainError
         If an array has the wrong shape, the wavelength is not covered, or a number is outside its range. A bad donut is
         no error: it is flagged, with NaN for results, and the others go on.
+    KeyboardInterrupt
+        At Ctrl-C; its ``fit`` has the results of the donuts that were finished, if any were.
     """
     model = (model or DonutModel()).with_light(wavelength).with_pixel_size(pixel_size).with_moved(moved)
     fit = _wavefront_fit(fit, noll, degrees_of_freedom)
@@ -177,59 +175,59 @@ def fit_donuts(
     shifts = model.detector.shifts(len(observed))
     strengths = model.air.strengths(instrument.seeing, len(observed))
 
-    with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
+    finished: dict[int, StarFit] = {}
+    fitted: _Fitted | None = None
 
-        def alone(
-            instrument: Instrument, i: int, begun: StarFit | None = None, *, preliminary: bool = False
-        ) -> StarFit:
-            star, defocus, strength = observed.star(i), float(shifts[i]), float(strengths[i])
-            return _fit_alone(instrument, star, defocus, strength, fit.joint, begun, preliminary)
+    def alone(instrument: Instrument, i: int, begun: StarFit | None = None, *, preliminary: bool = False) -> StarFit:
+        star, defocus, strength = observed.star(i), float(shifts[i]), float(strengths[i])
+        return _fit_alone(instrument, star, defocus, strength, fit.joint, begun, preliminary)
 
-        def fitted_stars(
-            instrument: Instrument, star_fit: Callable[[int], StarFit], report: Callable[[int], None] | None = None
-        ) -> _Fitted:
-            def prepared(i: int) -> StarFit:
-                star = star_fit(i)
-                if report is not None:
-                    report(1)
-                return fit.prepared(instrument, star)
+    def fitted_stars(
+        instrument: Instrument, star_fit: Callable[[int], StarFit], report: Callable[[int], None] | None = None
+    ) -> _Fitted:
+        def prepared(i: int) -> StarFit:
+            star = fit.prepared(instrument, star_fit(i))
+            finished.setdefault(i, star)
+            if report is not None:
+                report(1)
+            return star
 
-            stars = fit.sided(instrument, list(pool.map(prepared, range(len(observed)))), observed.fields)
-            solutions = {i: star.usable for i, star in enumerate(stars) if star.usable is not None}
-            if fit.joint and not solutions:
-                raise DomainError(f"no usable donut: {stars[0].flags.reasons if stars else 'no images'}")
-            index = np.array(list(solutions), dtype=np.int64)
-            usable = UsableStars(
-                instrument, list(solutions.values()), observed.fields[index], projection, observed.fields, index
-            )
-            return _Fitted(stars, solutions, fit.solved(usable, pool))
+        return _solved(instrument, observed, list(pool.map(prepared, range(len(observed)))), fit, pool)
 
-        def first(i: int) -> StarFit:
-            if i in vote.fitted:
-                return vote.fitted[i]
-            if i not in vote.begun:
-                return alone(instrument, i)
-            begun = vote.begun[i].with_light(instrument)
-            return alone(instrument, i, replace(begun, searched=not vote.diffraction))
+    def first(i: int) -> StarFit:
+        if i in vote.fitted:
+            return vote.fitted[i]
+        if i not in vote.begun:
+            return alone(instrument, i)
+        begun = vote.begun[i].with_light(instrument)
+        return alone(instrument, i, replace(begun, searched=not vote.diffraction))
 
-        def once_more(refined: Instrument) -> _Fitted:
-            return fitted_stars(refined, lambda i: alone(refined, i, replace(fitted.stars[i], searched=True)))
+    def once_more(refined: Instrument, fitted: _Fitted) -> _Fitted:
+        return fitted_stars(refined, lambda i: alone(refined, i, replace(fitted.stars[i], searched=True)))
 
-        vote = DiffractionVote(bool(model.diffraction))
-        if model.diffraction is None:
-            vote = vote_on_diffraction(instrument, alone, len(observed), pool)
-            instrument = replace(instrument, model=replace(model, diffraction=vote.diffraction))
-        fitted = fitted_stars(instrument, first, progress)
-        refined = fit.refined(instrument, list(fitted.solutions.values()), fitted.results)
-        if refined is not None:
-            again = once_more(refined)
-            if refined.free_rims.bodies and contradicted(fitted.solutions, again.solutions):
-                # Not the telescope's: each donut keeps the rims of its own fit.
-                refined = replace(refined, free_rims=instrument.free_rims)
-                again = fitted if refined.terms is instrument.terms else once_more(refined)
-            # No donut is lost by a refinement.
-            if not any(DonutFlag.NOT_CONVERGED in again.stars[i].flags for i in fitted.solutions):
-                instrument, fitted = refined, again
+    try:
+        with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
+            vote = DiffractionVote(bool(model.diffraction))
+            if model.diffraction is None:
+                vote = vote_on_diffraction(instrument, alone, len(observed), pool)
+                instrument = replace(instrument, model=replace(model, diffraction=vote.diffraction))
+            fitted = fitted_stars(instrument, first, progress)
+            refined = fit.refined(instrument, list(fitted.solutions.values()), fitted.results)
+            if refined is not None:
+                again = once_more(refined, fitted)
+                if refined.free_rims.bodies and contradicted(fitted.solutions, again.solutions):
+                    # Not the telescope's: each donut keeps the rims of its own fit.
+                    refined = replace(refined, free_rims=instrument.free_rims)
+                    again = fitted if refined.terms is instrument.terms else once_more(refined, fitted)
+                # No donut is lost by a refinement.
+                if not any(DonutFlag.NOT_CONVERGED in again.stars[i].flags for i in fitted.solutions):
+                    instrument, fitted = refined, again
+    except KeyboardInterrupt:
+        if not finished:
+            raise
+        if fitted is None:
+            fitted = _solved_in_part(instrument, observed, finished, fit)
+        raise InterruptedFitError(_result(instrument, observed, fitted)) from None
     result = _result(instrument, observed, fitted)
     warn_of_other_hole(instrument, fitted.solutions, result)
     return result
@@ -241,6 +239,32 @@ class _Fitted(NamedTuple):
     stars: list[StarFit]
     solutions: dict[int, StarSolution]
     results: FittedStars
+
+
+def _solved(
+    instrument: Instrument, observed: ObservedStars, stars: Sequence[StarFit], fit: WavefrontFit, pool: Executor
+) -> _Fitted:
+    """Return the results of stars that were fitted by themselves."""
+    stars = fit.sided(instrument, stars, observed.fields)
+    solutions = {i: star.usable for i, star in enumerate(stars) if star.usable is not None}
+    if fit.joint and not solutions:
+        raise DomainError(f"no usable donut: {stars[0].flags.reasons if stars else 'no images'}")
+    index = np.array(list(solutions), dtype=np.int64)
+    fields = observed.fields
+    usable = UsableStars(instrument, list(solutions.values()), fields[index], observed.projection, fields, index)
+    return _Fitted(stars, solutions, fit.solved(usable, pool))
+
+
+def _solved_in_part(
+    instrument: Instrument, observed: ObservedStars, finished: Mapping[int, StarFit], fit: WavefrontFit
+) -> _Fitted:
+    """Return the results of the stars that were finished when a fit was interrupted, flags for the others.
+
+    A joint fit is one of all stars: these have the results of the fit of each by itself.
+    """
+    stars = [finished.get(i, StarFit(DonutFlag.INTERRUPTED)) for i in range(len(observed))]
+    with one_blas_thread(), ThreadPoolExecutor(1) as pool:
+        return _solved(instrument, observed, stars, SingleDonuts(fit.noll) if fit.joint else fit, pool)
 
 
 def _wavefront_fit(
@@ -274,7 +298,7 @@ def _fit_alone(
         return StarFit(DonutFlag.NO_LIGHT)
     not_finite = ~np.isfinite(star.image) & ~star.masked
     masked = star.masked | not_finite
-    saturated = _saturated(np.where(masked, 0.0, star.image), masked, instrument.model.detector.saturation)
+    saturated = saturated_pixels(np.where(masked, 0.0, star.image), masked, instrument.model.detector.saturation)
     masked = masked | grown(saturated, ~masked)
     donut = light.diameter > SMALLEST_DONUT * instrument.pixel
     wavefront = not joint or donut
@@ -290,7 +314,7 @@ def _fit_alone(
     fitted = _fit_with_steps(fitted_once, star, begun, wavefront and donut)
     if fitted.flags.usable:
         return replace(fitted, flags=fitted.flags | DonutFlag.CLIPPED) if (saturated | not_finite).any() else fitted
-    if saturated.sum() > max(_SEVERAL * star.image.size, 1.0):
+    if saturated.sum() > max(SEVERAL * star.image.size, 1.0):
         return StarFit(DonutFlag.SATURATED)
     if not_finite.any() and (DonutFlag.MOSTLY_LOST in fitted.flags or not_finite.mean() > _MOST):
         return StarFit(DonutFlag.NOT_FINITE)
@@ -377,20 +401,6 @@ def _without_steps(star: ObservedStar, steps: Sequence[AmplifierStep], fitted: S
         assert fitted is not None
         star = replace(star, image=step.taken_off(star.image, _light_level(fitted)))
     return star
-
-
-def _saturated(image: np.ndarray, masked: np.ndarray, level: float | None) -> np.ndarray:
-    """Return the saturated pixels: from a level on, or without one those of the greatest value where many have it.
-
-    Pixels with noise hardly agree unless they are saturated.
-    """
-    if level is not None:
-        high = (image >= level) & ~masked
-        if high.any():
-            return high
-    top = image.max(initial=0.0, where=~masked)
-    plateau = (image == top) & ~masked
-    return plateau if top > _FAINT and plateau.sum() > max(_SEVERAL * image.size, 1.0) else np.zeros_like(masked)
 
 
 def _response_slopes(instrument: Instrument, star: StarSolution) -> np.ndarray:

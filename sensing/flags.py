@@ -26,7 +26,7 @@ class DonutFlag(IntFlag):
     ``DEFOCUS_SIGN``: the image fits the other side of focus better. ``OUTSIDE_FIELD``: the telescope does not cover the
     field. ``NO_LIGHT``: no light passes the telescope there, or the chief ray does not reach a CCD.
     ``TOO_FEW_PHOTONS``: the donut stands out from the noise by less than 9 times the root of the number of Zernikes.
-    ``NOT_CONVERGED``: the fit did not converge.
+    ``NOT_CONVERGED``: the fit did not converge. ``INTERRUPTED``: Ctrl-C came before the fit.
     """
 
     OK = 0
@@ -48,6 +48,7 @@ class DonutFlag(IntFlag):
     MOSTLY_LOST = 32768
     ORIENTATION = 65536
     AMPLIFIER_STEP = 131072
+    INTERRUPTED = 262144
 
     @property
     def usable(self) -> bool:

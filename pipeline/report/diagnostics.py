@@ -77,7 +77,7 @@ class Diagnostics:
     missing: dict[str, str]  #: reason by CCD without a readable product
     table: Table  #: means and rms of the residuals, a row for each CCD
     overall: dict[str, float]  #: the same over all CCDs, and metrics of the correlations; keys end in their unit
-    #: Of each of :data:`~.KINDS`, with errors by jackknife over the CCDs where there are two or more; with a
+    #: Of each of :data:`~.KINDS`, with errors by jackknife over the CCDs where there are five or more; with a
     #: focal-plane model also of :data:`~.CCD_KINDS`, as in the table.
     correlations: dict[str, Correlation]
     rho: dict[str, RhoStatistics]  #: at the stars (``residual``), and at holdout positions (``away``)
@@ -254,6 +254,7 @@ def _overall_metrics(
         r = correlation.r_arcmin
         inside = np.flatnonzero(correlation.within("long") & (correlation.n_pairs > 0))
         largest = inside[np.argmax(np.abs(correlation.xi_plus[inside]))] if len(inside) else None
-        for key, values in (("r_arcmin", r), ("xi_plus", correlation.xi_plus), ("error_plus", correlation.error_plus)):
+        error = correlation.error_plus if correlation.n_patches else np.full_like(r, np.nan)
+        for key, values in (("r_arcmin", r), ("xi_plus", correlation.xi_plus), ("error_plus", error)):
             metrics[f"largest_{kind}_{key}"] = np.nan if largest is None else float(values[largest])
     return metrics

@@ -69,7 +69,11 @@ def draw_pictures(
     stars, close = [p.ccd_stars for p in products], closest_middle_farthest(products)
     components = noise_free_components(config)
     jackknife = all(c.n_patches for c in correlated.values())
-    errors = "by jackknife over the CCDs" if jackknife else "from the scatter of the ellipticities of one CCD alone"
+    errors = (
+        "by jackknife over the CCDs"
+        if jackknife
+        else "from the scatter of the ellipticities alone, and too small: there are too few CCDs for a jackknife"
+    )
     unweighted = recipe.weights == "equal" and not recipe.interpolation.needs_noise
     at_stars = (
         "Residuals at the stars of a CCD sum to zero by construction, so their correlation between CCDs cancels "

@@ -8,7 +8,7 @@ from typing import Any
 from astropy.table import Table
 
 from ...core.number_text import CellText, NumberText, number_with_error
-from ...measure.correlation import SEPARATION_RANGES
+from ...measure.correlation import FEWEST_PATCHES, SEPARATION_RANGES
 from ...models.camera.camera import Camera
 from ...models.camera.height_statistics import HeightStatistics
 from ..summary import CORRELATED
@@ -84,7 +84,8 @@ def verdict(summary: dict[str, Any]) -> str:
 MOMENTS_NOTE = (
     "g = (a - b)/(a + b) and T = Mxx + Myy are of adaptive moments, as of DES, HSC and Rubin; weighted e = (a - "
     "b)/(a + b) is of moments under a round weight, as in Jee & Tyson (2011), about half of g. The e of the LSST's "
-    "requirements is (a² - b²)/(a² + b²), about 2 g."
+    f"requirements is (a² - b²)/(a² + b²), about 2 g. Errors of ξ+ are a jackknife over {FEWEST_PATCHES} CCDs or more; "
+    "fewer are too few."
 )
 
 
@@ -216,9 +217,9 @@ DIAGNOSTICS_COLUMNS = (
 )
 DIAGNOSTICS_CAPTION = (
     "g and T = Mxx + Myy of adaptive moments, less those of the model and, for T, over its own value; rms of one "
-    "component. Largest ξ+ of either sign from 10' to 3 deg, with the jackknife error over the CCDs. Last, the "
-    "weighted e as in Jee & Tyson (2011), about half of g. A model that is constant on each CCD would leave the "
-    "scatter of the noise-free PSFs about the CCD's mean."
+    f"component. Largest ξ+ of either sign from 10' to 3 deg, with the jackknife error over {FEWEST_PATCHES} CCDs or "
+    "more. Last, the weighted e as in Jee & Tyson (2011), about half of g. A model that is constant on each CCD would "
+    "leave the scatter of the noise-free PSFs about the CCD's mean."
 )
 
 
@@ -276,8 +277,8 @@ ATTRIBUTION_COLUMNS = (
 ATTRIBUTION_CAPTION = (
     "The same stars without one cause, in g and T of adaptive moments. rms of one component of the noise-free PSFs, "
     "and of the residuals at the stars and at the holdout positions; mean ξ+ below 10' and from there to 3 deg; "
-    "change: full case less this one beyond 10', with the jackknife error over the CCDs. Last, rms of the noise-free "
-    "PSFs in the weighted e of Jee & Tyson (2011)."
+    f"change: full case less this one beyond 10', with the jackknife error over {FEWEST_PATCHES} CCDs or more. Last, "
+    "rms of the noise-free PSFs in the weighted e of Jee & Tyson (2011)."
 )
 
 

@@ -109,7 +109,9 @@ def collected_images(
     sky = sky_electrons_per_pixel(experiment.band, config.atmosphere.exposure_s, pixel_scale)
     # Columns of the CCD, along which charge is transferred, run along x of the stamps where pixels exchange x and y.
     along_pixels = images.swapaxes(1, 2) if experiment.camera.transposed else images
-    collected = brighter_fatter(along_pixels, electrons, sensor=config.sensor.brighter_fatter, sky=sky)
+    # The charge of each snap moves boundaries.
+    snaps = experiment.snaps
+    collected = brighter_fatter(along_pixels, electrons / snaps, sensor=config.sensor.brighter_fatter, sky=sky / snaps)
     return collected.swapaxes(1, 2) if experiment.camera.transposed else collected
 
 

@@ -48,6 +48,9 @@ _PCA_STARS = 2000
 _EXTRA_NOISE = 1.0
 # Range of reduced chi-square outside of which there is a warning.
 _CHI2 = (0.7, 1.4)
+# CCDs up to which stars may be less likely with the telescope that they were taken with than without any: of the nine
+# of a raft in four of five exposures, by ln ratios of -8 to -16.
+_FEW_CCDS = 30
 
 # Where arguments of earlier versions stand.
 _INSTRUMENT = "telescope=Instrument.of(telescope, {})"
@@ -365,12 +368,14 @@ def _fit_warnings(
         if covariance.nugget > _EXTRA_NOISE * np.median(noise):
             ratio = np.sqrt(1.0 + covariance.nugget / np.median(noise))
             remarks.append(f"the stars scatter {ratio:.1f} times as much in {name} as the stated noise")
-    if np.isfinite(fitted.evidence) and fitted.evidence < 0.0:
-        remarks.append(
-            f"the stars are less likely with this telescope than without any (ln ratio {fitted.evidence:.0f}): it is"
-            " not the one that they were taken with, or its heights are far smaller than their prior allows"
-        )
     ccds = np.unique(field.data.places.ccd)
+    if np.isfinite(fitted.evidence) and fitted.evidence < 0.0:
+        wrong = "it is not the one that they were taken with, or its heights are far smaller than their prior allows"
+        few = f"{counted(len(ccds), 'CCD')} may be too few to tell it from turbulence; or "
+        remarks.append(
+            "the stars are less likely with this telescope than without any (ln ratio "
+            f"{fitted.evidence:.0f}): {few if len(ccds) <= _FEW_CCDS else ''}{wrong}"
+        )
     empty = [n for i, n in enumerate(field.mosaic.names) if i not in ccds and n in expected]
     if empty:
         shown = ", ".join(empty[:5]) + (", ..." if len(empty) > 5 else "")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
 from ...measure.correlation import LARGEST_SEPARATION, LEAST_SEPARATION, MOST_BINS, SeparationBins
 from ...measure.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
 from ...measure.rho_statistics import RhoStatistics, rho_statistics
-from ...measure.shapes import Shapes, fwhm, measure_shapes
+from ...measure.shapes import ShapeFlag, Shapes, fwhm, measure_shapes
 from ...measure.star_selection import StarFlag
 from ..psf_model.kriging import shape_numbers, star_noise
 from ..psf_model.model import PsfModel
@@ -233,6 +233,28 @@ class OwnStars(Result):
 def part_of(shapes: Shapes, chosen: np.ndarray) -> Shapes:
     """Return the shapes of some stars, those of a mask [n] or of indices."""
     return Shapes(**{name: value[chosen] for name, value in vars(shapes).items()})
+
+
+def with_left_out(own: OwnStars, positions: np.ndarray, kept: NDArray[np.bool_]) -> OwnStars:
+    """Return the result of the stars kept of a catalogue, a mask [n], with rows for all, whose positions are [n, 2]."""
+
+    def of_all(values: np.ndarray, others: float) -> np.ndarray:
+        all_stars = np.full(len(kept), others, dtype=values.dtype)
+        all_stars[kept] = values
+        return all_stars
+
+    shapes = {
+        name: of_all(value, ShapeFlag.NOT_CONVERGED if name == "flags" else np.nan)
+        for name, value in vars(own.shapes).items()
+    }
+    return replace(
+        own,
+        positions=positions,
+        snr=of_all(own.snr, np.nan),
+        flags=of_all(own.flags, StarFlag.FLAGGED_IN_CATALOGUE),
+        used=of_all(own.used, False),
+        shapes=Shapes(**shapes),
+    )
 
 
 def star_rho_statistics(places: np.ndarray, stars: Shapes, model: Shapes, bins: int) -> RhoStatistics:

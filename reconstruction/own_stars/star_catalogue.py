@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from astropy.io import fits
 from astropy.table import Table
+from numpy.typing import NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import ProductError
@@ -28,6 +29,20 @@ OTHER_NAMES = {
     "weight": ("vignet_weight", "weights"),
     "variance": ("vignet_variance",),
     "mask": ("vignet_mask", "masks", "badpix"),
+}
+
+#: Bits of SExtractor's FLAGS that leave a star out, as in PSFEx: all but 1, neighbours that bias photometry.
+FLAG_MASK = 0xFE
+#: Bits of SExtractor's FLAGS, in words.
+FLAG_WORDS = {
+    1: "with neighbours",
+    2: "blended",
+    4: "saturated",
+    8: "cut by an edge",
+    16: "with incomplete apertures",
+    32: "with incomplete isophotes",
+    64: "out of memory in deblending",
+    128: "out of memory in extraction",
 }
 
 # Names of images that are no stamps.
@@ -50,15 +65,36 @@ class StarCutouts(_Cutouts):
         In the unit of the table, [n, 2].
     colour : ndarray or None
         Colours, NaN where a row has none, [n]; None where no column is named.
+    flags : ndarray or None
+        Column FLAGS, bits as of SExtractor, int [n]; None without one.
     """
 
     colour: np.ndarray | None
+    flags: np.ndarray | None
 
-    def __new__(cls, stamps: np.ndarray, positions: np.ndarray, colour: np.ndarray | None = None) -> StarCutouts:
-        """Return stamps and positions with colours."""
+    def __new__(
+        cls,
+        stamps: np.ndarray,
+        positions: np.ndarray,
+        colour: np.ndarray | None = None,
+        flags: np.ndarray | None = None,
+    ) -> StarCutouts:
+        """Return stamps and positions with colours and flags."""
         cutouts = super().__new__(cls, stamps, positions)
         cutouts.colour = colour
+        cutouts.flags = flags
         return cutouts
+
+    def unflagged(self, flag_mask: int = FLAG_MASK) -> NDArray[np.bool_]:
+        """Return the stars without any of the bits of a mask in their flags, [n]; all where there are no flags."""
+        if self.flags is None:
+            return np.ones(len(self.stamps), dtype=bool)
+        return np.asarray(self.flags & flag_mask == 0)
+
+    def part(self, chosen: NDArray[np.bool_]) -> StarCutouts:
+        """Return some of the stars, those of a mask [n]."""
+        colour, flags = (None if values is None else values[chosen] for values in (self.colour, self.flags))
+        return StarCutouts(self.stamps[chosen], self.positions[chosen], colour, flags)
 
 
 @check_arguments
@@ -103,8 +139,8 @@ def load_stars(
     Returns
     -------
     StarCutouts
-        Stamps and positions, to be unpacked, and ``colour`` where a column is named. Pixels without weight, and bad
-        ones (:mod:`~pachon.measure.pixel_masks`), are NaN.
+        Stamps and positions, to be unpacked, ``colour`` where a column is named, and ``flags`` where there is a column
+        FLAGS of whole numbers. Pixels without weight, and bad ones (:mod:`~pachon.measure.pixel_masks`), are NaN.
 
     Raises
     ------
@@ -187,7 +223,16 @@ def load_stars(
         ),
         positions,
         None if colour is None else _checked_column(path, colour, columns[names[colour.lower()]], 1),
+        _flags_column(columns),
     )
+
+
+def _flags_column(columns: dict[str, np.ndarray]) -> np.ndarray | None:
+    """Return a column FLAGS of one whole number in every row; None without one."""
+    values = next((values for name, values in columns.items() if name.lower() == "flags"), None)
+    if values is None or values.dtype.kind not in "iu" or values.ndim != 1:
+        return None
+    return values.astype(np.int64)
 
 
 def _one_row_a_star(columns: dict[str, np.ndarray], x: str) -> dict[str, np.ndarray]:

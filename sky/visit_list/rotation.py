@@ -16,6 +16,8 @@ from .list_columns import ListColumns
 #: Largest typical difference with which a list follows a convention [rad]: q of schedulers lacks precession.
 _TOLERANCE = np.deg2rad(2.0)
 _QUARTER = 0.5 * np.pi
+# Camera with a convention of its own.
+_COMCAM = "comcam"
 
 
 def wrapped(angles: np.ndarray) -> np.ndarray:
@@ -30,6 +32,11 @@ def conventions(rotator: np.ndarray, zenith: np.ndarray) -> dict[str, np.ndarray
         "q - rotTelPos (ComCam)": zenith - rotator,
         "rotTelPos - q (imSim's first lists)": rotator - zenith,
     }
+
+
+def sky_rotations(rotator: np.ndarray, zenith: np.ndarray, camera: str) -> np.ndarray:
+    """Return the angles of a camera on the sky [rad], rotSkyPos by the convention of the camera, -pi to pi."""
+    return wrapped(zenith - rotator - (0.0 if camera == _COMCAM else _QUARTER))
 
 
 def rotator_angles(columns: ListColumns, zenith: np.ndarray, camera: str) -> np.ndarray:
@@ -48,10 +55,11 @@ def rotator_angles(columns: ListColumns, zenith: np.ndarray, camera: str) -> np.
         return np.zeros(len(columns))
     columns.require("rotator", "sky_rotation")
     sky = columns.complete("sky_rotation", lambda angle: np.abs(angle) <= 4.0 * np.pi, "a finite angle")
-    is_comcam = camera == "comcam"
+    is_comcam = camera == _COMCAM
     formula = "q - rotSkyPos" if is_comcam else "q - rotSkyPos - 90 deg"
     columns.remarks.append(f"no rotTelPos: it is {formula}, as of {'ComCam' if is_comcam else 'LSSTCam'}")
-    return wrapped(zenith - sky - (0.0 if is_comcam else _QUARTER))
+    # Angles on the sky and of the rotator follow from each other in the same way.
+    return sky_rotations(sky, zenith, camera)
 
 
 def _agreement(rotator: np.ndarray, sky: np.ndarray, zenith: np.ndarray) -> str:

@@ -80,7 +80,10 @@ def attribution_plot(
 ) -> bytes:
     """Draw rms of g and of its residuals as bars, and xi+ of g as curves, for each case."""
     cases = list(metrics)
-    colors = dict(zip(cases, matplotlib.colormaps["tab10"](np.arange(len(cases)) % 10), strict=True)) | {FULL: "black"}
+    number = np.arange(len(cases))
+    # Ten dark colours, then ten light ones: there are up to twelve cases.
+    shades = matplotlib.colormaps["tab20"]((2 * number + number // 10) % 20)
+    colors = dict(zip(cases, shades, strict=True)) | {FULL: "black"}
     with styled():
         figure = new_figure(12.5, 3.4 + 0.42 * len(cases) + 3.4)
         panels = figure.subplots(2, 2, height_ratios=[1.2 + 0.42 * len(cases), 4.6])

@@ -16,6 +16,7 @@ from ...core.table_files import parquet_bytes
 from ...pipeline.experiment import Experiment
 from ...pipeline.listed_visit import instrument_of
 from ...pipeline.run_folder import SUMMARY_NAME
+from ...sky.visit_list.rotation import sky_rotations
 from ...sky.visit_list.visit_list import VisitList
 from . import detector_row as rows
 from . import residual_correlation as xi
@@ -34,7 +35,8 @@ _VISIT_COLUMNS = {
     "band": ("", "band"),
     "ra": ("deg", "pointing, ICRS"),
     "dec": ("deg", "pointing, ICRS"),
-    "skyRotation": ("deg", "position angle of the telescope's +y, north through east"),
+    "skyRotation": ("deg", "angle of the camera on the sky, rotSkyPos; of LSSTCam that of +y of images, north to east"),
+    "telescopeRotation": ("deg", "position angle of the telescope's +y, north through east"),
     "rotTelPos": ("deg", "camera against telescope"),
     "zenithDistance": ("deg", "zenith distance"),
     "azimuth": ("deg", "azimuth"),
@@ -88,7 +90,8 @@ def write_night(
     meta = {"what": "PSF, sky and depth of each visit and detector", "instrument": instrument_of(experiment.camera)}
     if described:
         write_named_table(folder / DETECTOR_TABLE, described, {**meta, **stamp.meta()})
-    write_named_table(folder / VISIT_TABLE, _visit_columns(visits), {"what": "visits of the list", **stamp.meta()})
+    of_visits = _visit_columns(visits, experiment.camera.name)
+    write_named_table(folder / VISIT_TABLE, of_visits, {"what": "visits of the list", **stamp.meta()})
     if maps is not None:
         maps.write(folder, stamp)
     means = {band: xi.mean_correlations(correlated[band]) for band in sorted(correlated)}
@@ -126,15 +129,16 @@ def write_named_table(path: Path, columns: Columns, meta: dict[str, Any]) -> Non
     write_bytes(file, content)
 
 
-def _visit_columns(visits: VisitList) -> Columns:
-    """Return the columns of the table of visits."""
+def _visit_columns(visits: VisitList, camera: str) -> Columns:
+    """Return the columns of the table of visits with a camera."""
     degrees = np.rad2deg
     values = {
         "visitId": visits.visit,
         "band": visits.band,
         "ra": degrees(visits.ra),
         "dec": degrees(visits.dec),
-        "skyRotation": degrees(visits.roll),
+        "skyRotation": degrees(sky_rotations(visits.rotator, visits.roll, camera)) % 360.0,
+        "telescopeRotation": degrees(visits.roll),
         "rotTelPos": degrees(visits.rotator),
         "zenithDistance": 90.0 - degrees(visits.altitude),
         "azimuth": degrees(visits.azimuth),

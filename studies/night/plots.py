@@ -152,4 +152,5 @@ class _Grid:
             return
         axes.set(xlabel="right ascension [deg]", ylabel="declination [deg]")
         axes.set_xlim(self.ra + self._offset[-1], self.ra + self._offset[0])
+        axes.xaxis.set_major_formatter(lambda ra, _: f"{round(ra, 6) % 360.0:g}")  # of a field about 0 h
         axes.set_aspect(1.0 / max(np.cos(np.deg2rad(self._dec.mean())), 0.02))

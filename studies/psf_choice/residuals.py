@@ -12,7 +12,7 @@ from ...core.statistics import finite_mean
 from ...core.threads import one_blas_thread
 from ...core.units import ARCMIN
 from ...measure.adaptive_moments import AdaptiveMoments
-from ...measure.correlation import SEPARATION_RANGES, SeparationBins, jackknife_error, shear_correlation
+from ...measure.correlation import FEWEST_PATCHES, SEPARATION_RANGES, SeparationBins, jackknife_error, shear_correlation
 from ...measure.rho_statistics import trace_of_moments
 from ...measure.shapes import Shapes, measure_shapes
 from ...pipeline.experiment import Experiment
@@ -161,7 +161,8 @@ def case_metrics(samples: Sequence[Residuals]) -> dict[str, float]:
         # Mean squares [n_draw, n_ccd]: the draws of a CCD share its PSF, so the CCDs give the error.
         ccd_squares = squares.mean(axis=0)
         result[name] = value = float(np.sqrt(ccd_squares.mean()))
-        error = ccd_squares.std(ddof=1) / np.sqrt(len(ccd_squares)) if len(ccd_squares) > 1 else np.nan
+        enough = len(ccd_squares) >= FEWEST_PATCHES
+        error = ccd_squares.std(ddof=1) / np.sqrt(len(ccd_squares)) if enough else np.nan
         result[f"error_{name}"] = float(0.5 * error / value) if value > 0.0 else np.nan
 
     for k, kind in enumerate(KINDS):
@@ -175,8 +176,9 @@ def case_metrics(samples: Sequence[Residuals]) -> dict[str, float]:
             result[f"noise_law_{prefix}{kind}"] = float(np.sqrt(law[:, :, k, m].mean()))
             for b, name in enumerate(SEPARATION_RANGES):
                 result[f"xi_plus_{prefix}{kind}_{name}"] = float(xi[:, k, m, b].mean())
-                error = jackknife_error(xi_without[:, k, m, :, b].mean(axis=0))
-                result[f"error_xi_plus_{prefix}{kind}_{name}"] = float(error)
+                without_ccd = xi_without[:, k, m, :, b].mean(axis=0)
+                error = float(jackknife_error(without_ccd)) if len(without_ccd) >= FEWEST_PATCHES else np.nan
+                result[f"error_xi_plus_{prefix}{kind}_{name}"] = error
     result["lost"] = float(sum(s.lost for s in samples))
     return result
 

@@ -43,7 +43,7 @@ class Study:
     Metrics of each fitted case, of adaptive moments, are ``rms_g_`` and ``rms_dt_g_`` (one component of g; dT/T),
     ``mean_g_`` (rms over the CCDs of the mean of one component), ``noise_law_g_`` (rms of g by noise alone) and
     ``xi_plus_g_..._short``, ``_long`` (below and beyond 10') of each of
-    :data:`~pachon.studies.psf_choice.residuals.KINDS`, with an ``error_`` over the CCDs where it is defined; of the
+    :data:`~pachon.studies.psf_choice.residuals.KINDS`, with an ``error_`` over five CCDs or more; of the
     weighted e as the paper's ``rms_e_``, ``rms_size_``, ``mean_e_``, ``noise_law_`` and ``xi_plus_``; and ``lost``,
     holdout positions at which the model has no shape, over all draws.
 

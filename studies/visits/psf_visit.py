@@ -219,10 +219,10 @@ def visit_psfs(
         stamps = resample_stamps(np.concatenate(images), matrix, frame.size, threads=threads)
         return np.asarray(stamps / stamps.sum(axis=(1, 2), keepdims=True, dtype=np.float64).astype(np.float32))
 
-    return VisitPsfs(rows, turned(true), turned(model), simulated.not_modelled, _weight_of(experiment, visit))
+    return VisitPsfs(rows, turned(true), turned(model), simulated.not_modelled, stack_weight(experiment, visit))
 
 
-def _weight_of(experiment: Experiment, visit: Visit) -> float | None:
+def stack_weight(experiment: Experiment, visit: Visit) -> float | None:
     """Return the weight of a visit of a list: that of the list, or the inverse variance of a pixel of its sky."""
     if visit.listed is None:
         return None

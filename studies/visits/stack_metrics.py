@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...core.units import ARCMIN, ARCSEC
-from ...measure.correlation import SEPARATION_RANGES, Correlation, shear_correlation
+from ...measure.correlation import SEPARATION_RANGES, Correlation, patches_of_jackknife, shear_correlation
 from ...pipeline.summary import bins_up_to
 from .stack import PsfStack
 
@@ -43,20 +43,19 @@ def correlations(
 ) -> StackCorrelations:
     """Return correlations of ellipticities e1, e2 at some of the positions [rad], all in the same bins, by kind.
 
-    Errors are those of a jackknife over patches, where there are several.
+    Errors are those of a jackknife over patches, where there are :data:`~.FEWEST_PATCHES` or more.
     """
     extent = float(np.hypot(np.ptp(x), np.ptp(y)))
     bins = bins_up_to(min(extent, SEPARATION_RANGES["long"][1] * ARCMIN))
     correlated = {}
     for kind, (e1, e2, rows) in values.items():
-        several = len(np.unique(patch[rows])) > 1
         correlated[kind] = shear_correlation(
             x[rows],
             y[rows],
             e1[rows],
             e2[rows],
             bins=bins,
-            patch=patch[rows] if several else None,
+            patch=patches_of_jackknife(patch[rows]),
         )
     return correlated
 

@@ -25,7 +25,15 @@ from ...pipeline.run_folder import CONFIG_NAME, SUMMARY_NAME
 from .config import STACK_STAMP, VisitsConfig, load_visits_configuration
 from .plan import Visit
 from .plots import correlation_picture, ellipticity_picture
-from .psf_visit import StackFrame, VisitPsfs, check_rotators, magnitude_limits, visit_experiment, visit_psfs
+from .psf_visit import (
+    StackFrame,
+    VisitPsfs,
+    check_rotators,
+    magnitude_limits,
+    stack_weight,
+    visit_experiment,
+    visit_psfs,
+)
 from .sky_points import SkyPoints, draw_points
 from .stack import PsfStack, PsfSums
 from .stack_metrics import StackCorrelations, stack_correlations, stack_metrics
@@ -141,7 +149,7 @@ def stack_visits(
     stacks = {n: PsfStack.read(stack_path(folder, n), stamp) for n in config.kept}
     with reporter.stage("correlations"):
         correlated = {n: stack_correlations(stack, cell_of(experiment, frame)) for n, stack in stacks.items()}
-    summary = _write_products(folder, config, stamp, visits, stacks, correlated)
+    summary = _write_products(folder, config, experiment, stamp, visits, stacks, correlated)
     return StackResult(folder, stacks, correlated, summary)
 
 
@@ -219,6 +227,7 @@ def _check_room(folder: Path, points: SkyPoints, stacks: int) -> None:
 def _write_products(
     folder: Path,
     config: VisitsConfig,
+    experiment: Experiment,
     stamp: Stamp,
     visits: tuple[Visit, ...],
     stacks: dict[int, PsfStack],
@@ -235,6 +244,11 @@ def _write_products(
         run = config.run.rotator_deg
         angles = np.array([run if v.rotator_deg is None else v.rotator_deg for v in visits])
         columns["rotator"] = (angles, "deg", "of the camera, from +x towards +y of the telescope")
+    listed = [v.listed for v in visits if v.listed is not None]
+    if listed:
+        weights = [stack_weight(visit_experiment(experiment, v), v) for v in visits]
+        columns["visitId"] = (np.array([visit.visit for visit in listed]), "", "number of the visit in the list")
+        columns["weight"] = (np.array(weights), "nJy-2", "of its PSFs in the stack, by an inverse variance")
     write_ecsv(folder / "visits.ecsv", columns, {"what": "visits in the order of the stack", **stamp.meta()})
     summary = {
         **stamp.meta(),

@@ -381,12 +381,44 @@ def interrupted(*_, **__):
     raise KeyboardInterrupt
 
 
-def test_an_interrupted_fit_says_that_nothing_is_written(tmp_path, monkeypatch, capsys):
+@pytest.mark.long
+@pytest.mark.parametrize("joint", [False, True])
+def test_an_interrupted_fit_writes_the_donuts_that_were_finished(tmp_path, monkeypatch, capsys, stamp, joint):
+    monkeypatch.chdir(tmp_path)
+    header = fits.Header({"FIELD_X": FIELD[0], "FIELD_Y": FIELD[1]})
+    # The last ones are not reached.
+    fits.PrimaryHDU(np.stack([stamp, stamp + 1.0, *[stamp] * 4]), header).writeto("donuts.fits")
+    fits.PrimaryHDU(np.stack([stamp, stamp + 1.0]), header).writeto("two.fits")
+    options = ["--threads", "1", "--quiet", *OPTIONS] + ["--each-alone"] * (not joint)
+    assert main(["donuts", "two.fits", *options, "-o", "two.ecsv"]) == 0
+    finished = 0
+
+    def advance(stage, count=1):
+        nonlocal finished
+        finished += count
+        if finished >= 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("pachon.core.progress.Stage.advance", advance)
+    capsys.readouterr()
+    assert main(["donuts", "donuts.fits", *options, "-o", "part.ecsv"]) == 130
+    assert re.fullmatch(
+        r"pachon: error: interrupted; [2-4] of 6 donuts fitted, in part\.ecsv\n", capsys.readouterr().err
+    )
+    found, whole = Table.read("part.ecsv"), Table.read("two.ecsv")
+    assert found["reasons"][:2].tolist() == whole["reasons"].tolist() == ["ok", "ok"]
+    assert found["reasons"][-1] == "interrupted"
+    assert np.isnan(found["Z4"][-1])
+    if not joint:
+        assert found["Z4"][:2].tolist() == whole["Z4"].tolist()
+
+
+def test_a_fit_that_is_interrupted_before_the_first_donut_writes_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     fits.PrimaryHDU(np.zeros((2, 16, 16))).writeto("plain.fits")
     monkeypatch.setattr("pachon.sensing.fit.fit_donuts", interrupted)
     assert main(["donuts", "plain.fits", "--field-deg", "0,1", "--defocus-um", "1500", "-o", "a.ecsv"]) == 130
-    error = "pachon: error: interrupted; nothing is written before all donuts are fitted\n"
+    error = "pachon: error: interrupted; no donut was finished\n"
     assert capsys.readouterr().err == error
     assert not (tmp_path / "a.ecsv").exists()
 

@@ -1,10 +1,17 @@
 """Noise, saturation and levels of exposures against their statistics, and the formulas of SMTN-002."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pachon.core.errors import ConfigError, DomainError
 from pachon.imaging.exposure import SATURATED, Exposure, expose
+from pachon.pipeline.config import Configuration, ListedVisitConfig
+from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.sensor.brighter_fatter import brighter_fatter
+from pachon.pipeline.simulate.ccd_observation import collected_images
+from pachon.pipeline.simulate.photometry import sky_electrons_per_pixel
 
 SCENE = np.full((300, 400), 250.0, dtype=np.float32)
 #: Background of 15 s in r: dark sky of 21.2 mag over 0.04 arcsec^2, zero point 28.36 + 0.13, and 0.2 e-/s dark current.
@@ -107,3 +114,70 @@ def test_bad_settings_are_named(options, text):
 def test_an_unknown_band_is_named():
     with pytest.raises(ConfigError, match="band = 'v': expected one of u, g, r, i, z, y"):
         Exposure(band="v")
+
+
+def gaussians(shape, places, electrons, sigma=1.5):
+    """Sampled Gaussians [electron] at whole pixels (y, x)."""
+    y, x = np.indices(shape)
+    light = (
+        e * np.exp(-((x - i) ** 2 + (y - j) ** 2) / (2 * sigma**2)) for (j, i), e in zip(places, electrons, strict=True)
+    )
+    return sum(light) / (2.0 * np.pi * sigma**2)
+
+
+def test_bright_stars_on_an_image_are_broader():
+    """As the same stars on stamps are, each by itself, wherever a band of rows ends; HSM of GalSim sees them grow."""
+    galsim = pytest.importorskip("galsim")
+    places, electrons = [(60, 60), (127, 150), (250, 240), (150, 340)], np.array([1e3, 1e5, 4e5, 8e5])
+    scene = gaussians((300, 400), places, electrons).astype(np.float32)
+    settings = Exposure(noise=False, brighter_fatter="e2v", full_well=1e6)
+    image = expose(scene, settings, 1, "A").image.astype(np.float64)
+    plain = expose(scene, replace(settings, brighter_fatter=None), 1, "A").image.astype(np.float64)
+    assert image.sum() == pytest.approx(plain.sum(), rel=1e-7)  # single precision
+    growth = []
+    for (j, i), count in zip(places, electrons, strict=True):
+        stamp = np.s_[j - 20 : j + 21, i - 20 : i + 21]
+        light = plain[stamp] / count
+        expected = brighter_fatter(light[None], np.array([count]), sensor="e2v", sky=settings.background)[0]
+        # A hundred-thousandth of the peak: single precision of the image.
+        np.testing.assert_allclose(image[stamp] / count, expected, rtol=0.0, atol=1e-6)
+        sizes = [galsim.hsm.FindAdaptiveMom(galsim.Image(v[stamp].copy())).moments_sigma for v in (image, plain)]
+        growth.append(sizes[0] / sizes[1] - 1.0)
+    # In proportion to the electrons, 1.2 % at 8e5; HSM ends its iterations at about 1e-4.
+    np.testing.assert_allclose(growth, growth[3] * electrons / electrons[3], rtol=0.0, atol=1.5e-4)
+    assert 0.01 < growth[3] < 0.03
+
+
+def test_boundaries_of_pixels_move_anew_in_each_exposure():
+    scene = gaussians((100, 90), [(50, 40)], [3e5]).astype(np.float32)
+    one = Exposure(noise=False, brighter_fatter="itl", full_well=1e6)
+    found = [expose(n * scene, replace(one, exposures=n), 1, "A").image / n for n in (1, 3)]
+    np.testing.assert_allclose(found[1], found[0], rtol=2e-6, atol=1e-2)  # single precision of 2e4 electrons
+    # A pixel that is full repels no more.
+    full = expose(1e4 * scene, replace(one, full_well=1e5), 1, "A").image
+    assert np.isfinite(full).all()
+
+
+def test_the_charge_of_one_snap_moves_boundaries():
+    """A visit of two snaps has half of the effect of one exposure of the same light, to first order."""
+    scene = gaussians((60, 60), [(30, 30)], [4e5]).astype(np.float32)
+    plain, whole, halves = (
+        expose(scene, Exposure(noise=False, full_well=1e6, **more), 1, "A").image.astype(np.float64)
+        for more in ({}, {"brighter_fatter": "itl"}, {"brighter_fatter": "itl", "snaps": 2})
+    )
+    changes = halves[30, 30] - plain[30, 30], whole[30, 30] - plain[30, 30]
+    assert changes[0] == pytest.approx(0.5 * changes[1], rel=0.02)
+    visit = ListedVisitConfig(number=1, mid_mjd=61000.0, snaps=2)
+    experiment = Experiment.from_config(Configuration(ccds=["R22_S11"], visit=visit, sensor={"brighter_fatter": "itl"}))
+    assert Exposure.of_run(experiment).snaps == 2
+    star = scene[None].astype(np.float64) / 4e5
+    collected = collected_images(experiment, star, 1e-6, np.array([4e5]))[0]
+    sky = sky_electrons_per_pixel(experiment.band, 15.0, 1e-6)
+    # The camera's pixels exchange x and y.
+    expected = brighter_fatter(star.swapaxes(1, 2), np.array([2e5]), sensor="itl", sky=0.5 * sky).swapaxes(1, 2)[0]
+    np.testing.assert_array_equal(collected, expected)
+
+
+def test_the_sensor_of_a_run_is_that_of_its_images():
+    settings = {"sensor": {"brighter_fatter": "itl"}, "ccds": ["R22_S11"]}
+    assert Exposure.of_run(Experiment.from_config(Configuration(**settings))).brighter_fatter == "itl"

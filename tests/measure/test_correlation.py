@@ -7,7 +7,13 @@ import pytest
 from astropy import units as u
 
 from pachon.core.errors import ConfigError, DomainError
-from pachon.measure.correlation import EXACT_LIMIT, SeparationBins, shear_correlation
+from pachon.measure.correlation import (
+    EXACT_LIMIT,
+    SeparationBins,
+    jackknife_error,
+    patches_of_jackknife,
+    shear_correlation,
+)
 
 ARCMIN = np.pi / 180.0 / 60.0
 BINS = SeparationBins(1.0 * ARCMIN, 60.0 * ARCMIN, 8)
@@ -206,6 +212,16 @@ def test_no_jackknife_where_one_patch_holds_all_pairs():
     assert c.error_plus[0] == pytest.approx(0.005, rel=1e-6)  # single precision
     assert np.isnan(c.error_plus[1])
     assert np.isfinite(c.xi_plus[1])
+
+
+def test_patches_of_a_run_are_a_jackknife_from_five_on():
+    """The error of a jackknife of n patches is good to 1/sqrt(2 (n - 1)), as that of the variance of n numbers."""
+    assert patches_of_jackknife(np.repeat(np.arange(4), 9)) is None
+    assert patches_of_jackknife(np.repeat(np.arange(5), 2)).tolist() == np.repeat(np.arange(5), 2).tolist()
+    values = np.random.default_rng(6).normal(size=(4000, 5))
+    variances = [jackknife_error((v.sum() - v) / 4.0) ** 2 for v in values]  # of the mean of five
+    assert np.mean(variances) == pytest.approx(0.2, rel=0.05)
+    assert np.std(variances) / np.mean(variances) / 2.0 == pytest.approx(1.0 / np.sqrt(8.0), rel=0.05)
 
 
 def test_cross_correlation_counts_both_orders():

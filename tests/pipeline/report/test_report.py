@@ -99,12 +99,12 @@ def test_text_of_a_user_is_escaped(finished_run, tiny):
     experiment = Experiment.from_config(tiny())
     telescope = dataclasses.replace(experiment.telescope, description="<b>mine</b> & yours")
     experiment = dataclasses.replace(experiment, telescope=telescope)
-    page = build_report(experiment, json.loads((finished_run / "summary.json").read_text()), [])
+    page = build_report(experiment, json.loads((finished_run / "summary.json").read_text().replace("null", "NaN")), [])
     assert "&lt;b&gt;mine&lt;/b&gt; &amp; yours" in page
 
 
 def test_the_page_says_what_the_camera_is_where_it_is_not_the_plain_one(finished_run, tiny):
-    summary = json.loads((finished_run / "summary.json").read_text())
+    summary = json.loads((finished_run / "summary.json").read_text().replace("null", "NaN"))
     options = {"detector__silicon": True, "rotator_deg": 90.0}
     plain, other = (build_report(Experiment.from_config(tiny(**o)), summary, []) for o in ({}, options))
     assert "engine, seed 1. PSF" in plain

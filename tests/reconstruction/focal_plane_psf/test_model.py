@@ -1,6 +1,7 @@
 """The model against synthetic exposures: holdout positions, heights, uncertainties, files, bad input."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from pachon.core.errors import ConfigError, DomainError, PachonError, ProductErr
 from pachon.measure.shapes import measure_shapes
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.silicon import Silicon
-from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf
+from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf, _fit_warnings
 from pachon.reconstruction.focal_plane_psf.optics_prior import OpticsPrior
 from pachon.reconstruction.focal_plane_psf.response import Instrument
 
@@ -156,6 +157,17 @@ def test_the_wrong_telescope_has_less_evidence(aligned, exposure, few, lsst_r, w
     assert wrong.evidence < 0.0 < aligned.evidence
     assert any("less likely with this telescope" in w for w in wrong.warnings)
     assert not any("less likely" in w for w in aligned.warnings)
+
+
+@pytest.mark.parametrize(("count", "few"), [(9, True), (189, False)])
+def test_few_ccds_are_no_proof_against_a_telescope(count, few):
+    """Of nine CCDs simulated with this very telescope stars are less likely with it in four of five exposures."""
+    places = SimpleNamespace(ccd=np.repeat(np.arange(count), 2))
+    data = SimpleNamespace(places=places, noise=np.ones((2 * count, 3)))
+    field = SimpleNamespace(covariances=[SimpleNamespace(nugget=0.0)] * 3, data=data, mosaic=SimpleNamespace(names=()))
+    (remark,) = _fit_warnings(field, {}, SimpleNamespace(at_bounds=(), evidence=-8.0), ())
+    assert "less likely with this telescope than without any (ln ratio -8): " in remark
+    assert ("9 CCDs may be too few" in remark) == few
 
 
 @pytest.mark.long

@@ -179,6 +179,41 @@ def test_the_command_leaves_model_picture_and_table(stars, tmp_path, monkeypatch
     assert np.isnan(table["held_out_e1"][5])
 
 
+def test_stars_that_sextractor_flags_are_left_out(stars, tmp_path, monkeypatch, capsys):
+    """As PSFEx leaves them out (SAMPLE_FLAGMASK 0x00fe): blended, saturated and cut ones, not those with neighbours."""
+    monkeypatch.chdir(tmp_path)
+    flags = np.zeros(COUNT, dtype=np.int16)
+    flags[[1, 2, 3, 4]] = 3, 4, 24, 1
+    x, y = stars.positions.T
+    columns = {"XWIN_IMAGE": x, "YWIN_IMAGE": y, "VIGNET": stars.stamps, "FLAGS": flags}
+    Table(columns).write("stars.fits")
+    Table({name: values[(flags & 0xFE) == 0] for name, values in columns.items() if name != "FLAGS"}).write("good.fits")
+    options = ["--no-picture", "--interpolation", "polynomial", "--order", "0"]
+
+    def model(file, *more):
+        assert main(["model", file, *options, *more]) == 0
+        return capsys.readouterr().out, Table.read(file.replace(".fits", "_psf.ecsv"))
+
+    out, table = model("stars.fits")
+    assert "2 saturated" not in out
+    assert "1 blended, 1 saturated, 1 cut by an edge, 1 with incomplete apertures; --flag-mask 0 keeps them" in out
+    assert table["x"].tolist() == x.tolist()
+    assert np.flatnonzero(table["flags"] == StarFlag.FLAGGED_IN_CATALOGUE).tolist() == [1, 2, 3]
+    assert set(np.flatnonzero(~table["used"])) == {1, 2, 3, 5}
+    # They leave no trace in the model of the others.
+    _, good = model("good.fits")
+    np.testing.assert_allclose(good["held_out_g1"], np.delete(table["held_out_g1"], [1, 2, 3]))
+    stamps = [PsfModel.read(f"{name}_psf.fits").draw(2000.0, 2000.0) for name in ("stars", "good")]
+    assert np.array_equal(*stamps)
+    out, table = model("stars.fits", "--flag-mask", "0")
+    assert "--flag-mask" not in out
+    assert table["used"].sum() == COUNT - 1
+    flags[:] = 2
+    Table(columns | {"FLAGS": flags}).write("stars.fits", overwrite=True)
+    assert main(["model", "stars.fits"]) == 2
+    assert "0 of 60 stars left (60 flagged in catalogue): expected at least 5" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

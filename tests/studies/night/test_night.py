@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
+from astropy.wcs import WCS
 
 from pachon.commands.night import listed_visit
 from pachon.core.errors import ConfigError, DomainError, ProductError
 from pachon.core.long_work import Execution
 from pachon.core.products import read_fits
-from pachon.pipeline.listed_visit import check_bands
+from pachon.imaging.wcs import ccd_wcs
+from pachon.pipeline.listed_visit import check_bands, visit_experiment
 from pachon.studies.night.maps import NightMaps
 from pachon.studies.night.night import run_night
 from pachon.studies.night.visit_product import VisitWork
@@ -45,6 +48,25 @@ def test_a_visit_that_fails_is_left_out(night):
     summary = json.loads((result.folder / "summary.json").read_text())
     assert (summary["visits"], summary["finished"], summary["complete"]) == (3, 3, True)
     assert list(summary["left_out"]) == ["1002"]
+
+
+def test_sky_rotation_of_the_table_is_that_of_images(night):
+    """As of LSST's table of visits: position angle of +y of the focal plane, here of an image by its header."""
+    config, result, _ = night
+    parquet = pytest.importorskip("pyarrow.parquet")
+    rows = parquet.read_table(result.folder / "visit.parquet").to_pydict()
+    assert rows["visitId"] == [1001, 1002, 1003]
+    columns = (rows[key] for key in ("visitId", "skyRotation", "telescopeRotation"))
+    for visit, rotation, telescope in zip(*columns, strict=True):
+        listed = config.read_list(None).of_visit(visit)
+        assert telescope == pytest.approx(np.rad2deg(listed.roll))
+        if visit in result.left_out:
+            continue
+        experiment = visit_experiment(config.run, listed)
+        wcs = ccd_wcs(experiment.telescope, experiment.camera, "R22_S11", pointing=experiment.pointing)
+        header = WCS(wcs.to_header())
+        below, above = (SkyCoord(*header.all_pix2world([[2000.0, y]], 0)[0], unit="deg") for y in (1900.0, 2100.0))
+        assert below.position_angle(above).deg == pytest.approx(rotation, abs=0.01)  # optical distortion
 
 
 def test_the_table_has_units_and_the_psf_of_the_products(night):

@@ -31,6 +31,17 @@ def test_single_pixels_are_seen_on_a_wide_sky(monkeypatch, apart):
     assert {tuple(drawn.get_clim()) for drawn in width.collections if drawn.get_array() is not None} == {(1.5, 2.0)}
 
 
+def test_right_ascensions_about_0_h_are_those_of_the_sky(monkeypatch):
+    healsparse = pytest.importorskip("healsparse")
+    content = healsparse.HealSparseMap.make_empty(32, 512, dtype=np.float64)
+    content.update_values_pos(np.array([352.0, 11.0]), np.array([-30.0, -20.0]), np.array([1.5, 2.0]))
+    monkeypatch.setattr(plots, "png_bytes", lambda figure: figure.draw_without_rendering() or figure)
+    panel = plots.maps_plot(SimpleNamespace(bands={"r": None}, pictured=lambda band: (content,) * 3)).axes[0]
+    labels = [float(text.get_text()) for text in panel.get_xticklabels()]
+    assert 0.0 <= min(labels) < 10.0
+    assert 350.0 < max(labels) < 360.0
+
+
 def test_maps_of_one_value_in_one_strip_can_be_read(monkeypatch):
     """Panels were lines beside tall colour bars, with fractions of visits."""
     healsparse = pytest.importorskip("healsparse")

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from astropy.io import fits
+from astropy.table import Table
 from visit_rows import COLUMNS, ROWS
 
 from pachon.core.errors import ConfigError, ProductError
@@ -13,7 +15,7 @@ from pachon.studies.night.config import ListSection
 from pachon.studies.visits.plan import listed_plan
 from pachon.studies.visits.psf_visit import VisitPsfs
 from pachon.studies.visits.stack import PsfSums
-from pachon.studies.visits.visits import stack_visits
+from pachon.studies.visits.visits import SUMS_NAME, stack_visits
 
 
 @pytest.fixture
@@ -86,3 +88,12 @@ def test_a_stack_of_a_list(visits_config, list_file, tmp_path):
     assert 0.2 < sizes[1] <= sizes[0] < 0.5
     again = stack_visits(config, tmp_path / "one", execution=Execution(resume=True))
     np.testing.assert_array_equal(again.stacks[2].true, result.stacks[2].true)
+    # Numbers of the list and the weights that its PSFs have in the sums.
+    visits = Table.read(tmp_path / "one" / "visits.ecsv")
+    assert visits["visitId"].tolist() == [1001, 1002]
+    one, two = visits["weight"]
+    with fits.open(tmp_path / "one" / SUMS_NAME) as hdus:
+        sums = np.unique(hdus["WEIGHT"].data)
+    assert sums.max() > 0.0
+    for weight in sums:
+        assert np.isclose(weight, [0.0, one, two, one + two], rtol=1e-6, atol=0.0).any()
