@@ -40,7 +40,7 @@ _PIXELS = 128
 #: Default number of pixels across wavelength times focal ratio.
 _PER_AIRY = 5.0
 #: Smallest default number of lattice points across the pupil.
-_FEWEST = 128
+_FEWEST = 256
 #: Largest number of lattice points across the pupil.
 _MOST = 2048
 #: Period of the pattern in sides of the image.

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import zoom
+from scipy.interpolate import PchipInterpolator
+from scipy.ndimage import map_coordinates, spline_filter
 
 from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import ConfigError, DomainError, shown
@@ -30,8 +31,11 @@ if TYPE_CHECKING:
 _PARTS = 4
 #: Distance of a centre from an image, beyond which no light is told from other light [pixels].
 _FARTHEST = 1e9
-#: Factor of the interpolated pixels along each axis; diffraction images are band-limited.
-_FINER = 3
+#: Order of the splines between the pixels of diffraction images, which are band-limited.
+_ORDER = 5
+#: Pairs of rings to a pixel on which these are sampled, and points on each to a pixel of the largest radius.
+_RINGS = 4
+_AROUND = 4
 #: Default number of radii.
 _RADII = 301
 #: Pixels on a side of the diffraction images.
@@ -192,15 +196,27 @@ def _of_images(psf: DiffractionPsf, radii: np.ndarray | None = None) -> Encircle
     radius = np.linspace(0.0, edge, _RADII) if radii is None else radii
     if radius[-1] > edge * (1 + 1e-9):
         raise DomainError(f"radii to {radius[-1] * 1e6:.6g} um: expected at most {edge * 1e6:.6g} um, the images' edge")
-    # The centre of the middle pixel among the finer ones.
-    middle = (psf.image.shape[-1] // 2 + 0.5) * _FINER - 0.5
-    rows = []
-    for image in psf.image:
-        # Pixels are samples at points; squares of uniform light would blur the image.
-        finer = zoom(image, _FINER, order=5, mode="nearest", grid_mode=True) / _FINER**2
-        at, within = energy_curve(finer, center=(middle, middle), parts=1)
-        rows.append(np.interp(radius, at * psf.pixel / _FINER, within))
+    rows = [_light_within(image, radius / psf.pixel) for image in psf.image]
     return EncircledEnergy(psf.request, "diffraction", radius, np.stack(rows), psf.plate_scale)
+
+
+def _light_within(image: np.ndarray, radii: np.ndarray) -> np.ndarray:
+    """Return the light within radii [pixels] of the middle pixel of a band-limited image, of samples at points."""
+    coefficients, middle = spline_filter(image, order=_ORDER, mode="mirror"), image.shape[-1] // 2
+    at = np.linspace(0.0, middle, 2 * _RINGS * middle + 1)
+    angle = 2.0 * np.pi * (np.arange(_AROUND * middle) + 0.5) / (_AROUND * middle)
+    around = np.stack([np.sin(angle), np.cos(angle)])
+
+    def mean_on_ring(ring: float) -> float:
+        on_ring = map_coordinates(coefficients, middle + ring * around, order=_ORDER, mode="mirror", prefilter=False)
+        return float(on_ring.mean())
+
+    mean = np.array([mean_on_ring(ring) for ring in at])
+    # Simpson's rule over two rings at a time.
+    light = 2.0 * np.pi * at * mean
+    step = (light[:-2:2] + 4.0 * light[1:-1:2] + light[2::2]) * (at[2] / 6.0)
+    edges, within = at[::2], np.concatenate([[0.0], np.cumsum(step)])
+    return np.asarray(PchipInterpolator(edges, within)(np.minimum(radii, middle)))
 
 
 @check_arguments
@@ -272,12 +288,9 @@ def _of_spots(diagram: SpotDiagram, radii: np.ndarray | None) -> EncircledEnergy
 
 
 def _crossing(fraction: np.ndarray, radius: np.ndarray, level: float) -> float:
-    """Return where a rising curve reaches a fraction, linear between two points."""
-    k = int(np.argmax(fraction >= level))
-    if k == 0:
-        return float(radius[0])
-    low, high = fraction[k - 1], fraction[k]
-    return float(radius[k - 1] + (level - low) / (high - low) * (radius[k] - radius[k - 1]))
+    """Return where a rising curve reaches a fraction, by monotone cubics between points."""
+    crossings = PchipInterpolator(radius, fraction - level, extrapolate=False).roots()
+    return float(crossings[0]) if len(crossings) else float(radius[np.argmax(fraction >= level)])
 
 
 def _draw_curves(axes: Axes, result: EncircledEnergy) -> None:

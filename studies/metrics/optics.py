@@ -23,7 +23,7 @@ _HIGHEST = 15
 #: telescope, to minutes of computing.
 _EE_PIXELS = 96
 #: Points across the pupil for the encircled energy, fixed for the same reason.
-_EE_POINTS = 192
+_EE_POINTS = 256
 #: Rays of each field for vignetting.
 _VIGNETTING_RAYS = 4096
 #: Slope over which the scale on the axis is taken [rad].

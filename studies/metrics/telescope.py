@@ -26,7 +26,7 @@ _RINGS = 6
 #: Pixels on a side of the images for the encircled energy.
 _PIXELS = 96
 #: Points across the pupil for the encircled energy.
-_ACROSS = 192
+_ACROSS = 256
 #: Rays of each field for the throughput.
 _RAYS = 4096
 #: Fraction of the light within the radius of encircled energy.

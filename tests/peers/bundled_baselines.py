@@ -17,7 +17,7 @@ BATOID = {
     "landing": "batoid within 1e-9 mm",
     "zernike": "batoid's rays and GalSim's annular Zernikes within 0.001 nm",
     "spot": "batoid within 1e-6 um",
-    "ee80": "Huygens integral over batoid's rays within 0.02 um",
+    "ee80": "Huygens integral over batoid's rays within 0.005 um",
     "distortion focal length": "batoid within 1e-9 m",
     "distortion axis focal length": "batoid within 3e-8 m",
     "distortion largest": "batoid within 1e-6 percent",

@@ -97,7 +97,7 @@ class Peer:
         A ray of weight w that fills the solid angle a has the amplitude sqrt(a) w, and the light of the whole image is
         wavelength^2 times the sum of w (Parseval).
         """
-        points = spiral(3000)
+        points = spiral(12000)
         weights = np.full(len(points), 1 / len(points))
         rays, step = self.rays(deg(field), self.middle, points), 1e-4
         turn = [
