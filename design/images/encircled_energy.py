@@ -289,8 +289,9 @@ def _of_spots(diagram: SpotDiagram, radii: np.ndarray | None) -> EncircledEnergy
 
 def _crossing(fraction: np.ndarray, radius: np.ndarray, level: float) -> float:
     """Return where a rising curve reaches a fraction, by monotone cubics between points."""
-    crossings = PchipInterpolator(radius, fraction - level, extrapolate=False).roots()
-    return float(crossings[0]) if len(crossings) else float(radius[np.argmax(fraction >= level)])
+    if not np.argmax(fraction >= level):
+        return float(radius[0])
+    return float(PchipInterpolator(radius, fraction - level, extrapolate=False).roots()[0])
 
 
 def _draw_curves(axes: Axes, result: EncircledEnergy) -> None:

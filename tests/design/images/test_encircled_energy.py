@@ -58,6 +58,12 @@ def test_radii_of_a_perfect_pupil(paraboloid, fraction):
     assert np.pi * found / (50.0 * WAVE) == pytest.approx(theory, rel=1.5e-3)
 
 
+def test_one_radius_is_a_curve_too(paraboloid):
+    energy = encircled_energy(paraboloid(f_number=50.0), [[0.0, 0.0]], WAVE, radii=[30e-6])
+    np.testing.assert_array_equal(energy.radius_holding(0.5), [30e-6])
+    assert np.isnan(energy.radius_holding(0.99)).all()
+
+
 def test_rays_of_a_defocused_annulus_fill_a_ring(paraboloid):
     telescope = paraboloid(f_number=20.0, obscuration=0.5, shift=1e-3)
     radii = np.linspace(5e-6, 26e-6, 22)
