@@ -31,7 +31,7 @@ def central_obscuration(telescope: Telescope) -> float:
     rim = 0.5 * telescope.pupil_diameter
     shadows = [0.0]
     for place, surface in enumerate(telescope.surfaces):
-        dark = 0.0 if surface.aperture is None else _dark_radius(surface.aperture)
+        dark = 0.0 if surface.aperture is None else _disc_radius(surface.aperture, covered=False)
         if dark > 0.0:
             # No ray of the axis may reach the surface.
             with suppress(DomainError):
@@ -61,26 +61,22 @@ def _pupil_radius(telescope: Telescope, place: int, dark: float, rim: float) -> 
     return paraxial
 
 
-def _dark_radius(aperture: Aperture) -> float:
-    """Return the radius of the largest disc about the origin outside a region [m]."""
-    if isinstance(aperture, Annulus):
-        return max(0.0, aperture.inner - float(np.hypot(aperture.x, aperture.y)))
-    if isinstance(aperture, Complement):
-        return _covered_radius(aperture.part)
-    if isinstance(aperture, Union | Intersection):
-        radii = [_dark_radius(part) for part in aperture.parts]
-        return max(radii) if isinstance(aperture, Intersection) else min(radii)
-    return 0.0
+def _disc_radius(aperture: Aperture, *, covered: bool) -> float:
+    """Return the radius of a disc about the origin within a region, or else outside it [m]: the largest of a shape.
 
-
-def _covered_radius(aperture: Aperture) -> float:
-    """Return the radius of a disc about the origin within a region [m]: the largest of a disc or ring."""
-    if isinstance(aperture, Circle) or (isinstance(aperture, Annulus) and aperture.inner == 0.0):
-        outer = aperture.radius if isinstance(aperture, Circle) else aperture.outer
-        return max(0.0, outer - float(np.hypot(aperture.x, aperture.y)))
+    A disc outside a region is one within its complement.
+    """
     if isinstance(aperture, Complement):
-        return _dark_radius(aperture.part)
+        return _disc_radius(aperture.part, covered=not covered)
     if isinstance(aperture, Union | Intersection):
-        radii = [_covered_radius(part) for part in aperture.parts]
-        return max(radii) if isinstance(aperture, Union) else min(radii)
-    return 0.0
+        radii = [_disc_radius(part, covered=covered) for part in aperture.parts]
+        return max(radii) if isinstance(aperture, Union) == covered else min(radii)
+    if isinstance(aperture, Circle):
+        inner, outer = 0.0, aperture.radius
+    elif isinstance(aperture, Annulus):
+        inner, outer = aperture.inner, aperture.outer
+    else:
+        return 0.0
+    if covered and inner > 0.0:
+        return 0.0
+    return max(0.0, (outer if covered else inner) - float(np.hypot(aperture.x, aperture.y)))

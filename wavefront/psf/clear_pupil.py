@@ -70,6 +70,11 @@ class SpokePupil:
         )
 
     @property
+    def area(self) -> float:
+        """Area of the annulus [m^2]."""
+        return float(math.pi * (self.radius[-1] ** 2 - self.radius[0] ** 2))
+
+    @property
     def n_spoke(self) -> int:
         """Number of spokes."""
         return len(self.unit)
@@ -95,9 +100,8 @@ def lit_fractions(
     """
     radius, obscuration = 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration
     if has_only_annuli(telescope):
-        unit = SpokePupil.fill(2.0 * radius, obscuration, 3 * _AREA_SPOKES, 3).unit
-        edges = clear_edges(telescope, direction, unit, wavelength, threads)
-        return clear_areas(edges) / (math.pi * radius**2 * (1.0 - obscuration**2))
+        pupil = SpokePupil.fill(2.0 * radius, obscuration, 3 * _AREA_SPOKES, 3)
+        return clear_areas(clear_edges(telescope, direction, pupil.unit, wavelength, threads)) / pupil.area
     points = spiral_annulus(radius, obscuration, _AREA_RAYS).points
     fractions = []
     for first in range(0, len(direction), _STARS):

@@ -207,6 +207,11 @@ class PsfRenderer(ABC):
         check_stamp(optics, inputs.plane)
         return optics
 
+    @property
+    def _cut_wavelength(self) -> float:
+        """Wavelength [m] at which apertures cut the light: all alike, but for 3e-4 at the edge of the LSST's field."""
+        return float(self._wavelengths[len(self._wavelengths) // 2])
+
     def _direction(self, fields: np.ndarray) -> np.ndarray:
         """Return directions in which the light of stars travels, shape [n_star, 3]."""
         return field_direction(fields[..., 0], fields[..., 1], self._inputs.projection)

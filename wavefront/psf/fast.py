@@ -280,9 +280,8 @@ class FastRenderer(PsfRenderer):
 
     def _lit_fraction(self, optics: PupilOptics, stars: Stars) -> np.ndarray:
         """Return the lit fractions of the pupil, [n_star, n_wave]; the points of an image are too few for them."""
-        # Apertures cut all wavelengths alike.
-        middle = float(self._wavelengths[len(self._wavelengths) // 2])
-        fraction = lit_fractions(self._telescope, self._direction(stars.fields), middle, self._threads)
+        directions = self._direction(stars.fields)
+        fraction = lit_fractions(self._telescope, directions, self._cut_wavelength, self._threads)
         return np.where(optics.lit.any(axis=2), fraction[:, None], 0.0)
 
     def _transforms(self, deposit: np.ndarray, optics: PupilOptics, light: np.ndarray) -> np.ndarray:

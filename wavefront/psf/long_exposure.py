@@ -389,13 +389,10 @@ class LongExposureRenderer(PsfRenderer):
         return np.concatenate([baseline[None], self._turbulence(baseline) / len(self._wavelengths)])
 
     def _edges(self, fields: np.ndarray, pupil: SpokePupil) -> np.ndarray:
-        # Apertures cut every wavelength alike but for 3e-4 of the light at the very edge of the LSST's field.
-        middle = float(self._wavelengths[len(self._wavelengths) // 2])
-        return clear_edges(self._telescope, self._direction(fields), pupil.unit, middle, self._threads)
+        return clear_edges(self._telescope, self._direction(fields), pupil.unit, self._cut_wavelength, self._threads)
 
     def _lit_fraction(self, edges: np.ndarray) -> np.ndarray:
-        inner, outer = self._pupil.radius[[0, -1]]
-        return clear_areas(edges) / (math.pi * (outer**2 - inner**2))
+        return clear_areas(edges) / self._pupil.area
 
     def _expose_spokes(self, optics: PupilOptics, edges: np.ndarray, stars: Stars, pupil: SpokePupil) -> ExposedStars:
         spectrum = self._exposed_spectra(self._transform(optics, edges, stars.photons, pupil), optics)
