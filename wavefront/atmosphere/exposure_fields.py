@@ -25,7 +25,6 @@ from ...models.zernike_polynomials import noll_to_nm
 from .field_kernels import add_wavefronts, factor_spectra, pairs, read_splines, spread_over_grid, zernikes
 from .mean_wavefront import mean_wavefront_covariance, radial_transform
 from .moment_covariance import PAIRS, ExposedAir, MomentResponse, as_matrices, moment_covariance
-from .spline import stencil_gain
 from .turbulence import path_spectrum
 
 #: Noll indices of the mean wavefront. On the LSST with 0.1 um of aberration Z12 to Z15 move ellipticities by 5e-4 (rms)
@@ -34,7 +33,7 @@ NOLL = range(4, 16)
 #: Side of the periodic grids over the diameter of the field.
 _MARGIN = 1.5
 #: Samples in the angle under which the highest layer crosses the pupil, at least. Half-variograms of the LSST's moments
-#: from 0.5 arcmin on are those of the theory within 6 %, from 1 arcmin on within 2 %; with 3 they lack 15 % at 0.5.
+#: from 0.5 arcmin on are those of the theory within 4 %, from 0.75 arcmin on within 2 %.
 _SAMPLES = 4.5
 #: Most samples on a side.
 _MOST_SAMPLES = 2048
@@ -102,12 +101,17 @@ class ExposureFields:
 
     common: np.ndarray  #: moments that all stars share, p, q, s [rad^2], [3]
     moments: SplineFields  #: those that change over the field
+    by_optics: np.ndarray  #: share of the variance of p, q, s that aberrations of the optics add, [3]
     common_wavefront: np.ndarray  #: Zernikes of :data:`NOLL` of the layers on the ground [m]
     wavefronts: tuple[SplineFields, ...]  #: of the others
 
     def moments_at(self, slopes: np.ndarray) -> np.ndarray:
         """Return p = Mxx - Myy, q = 2 Mxy, s = Mxx + Myy beyond their mean [rad^2] at field slopes [n, 2], [n, 3]."""
         return self.common + self.moments.at(slopes)
+
+    def optics_factor(self, aberration: np.ndarray) -> np.ndarray:
+        """Return factors of the moments where the square of aberrations is so many times their mean [n], [n, 3]."""
+        return np.sqrt(1.0 + self.by_optics * (aberration[:, None] - 1.0))
 
     def wavefronts_at(self, slopes: np.ndarray) -> np.ndarray:
         """Return Zernikes of :data:`NOLL` of the mean path [m] at field slopes [n, 2] [rad], [n, n_noll]."""
@@ -123,22 +127,23 @@ def draw_exposure(
 ) -> ExposureFields:
     """Draw the fields of one exposure; those of the last two are stored."""
     grid = FieldGrid.of(air, field_radius)
-    factors, shared = moment_spectrum(air, response, grid)
+    factors, shared, by_optics = moment_spectrum(air, response, grid)
     random = stream(seed, "atmosphere", epoch, "moments")
     common = shared @ random.standard_normal(3)
     modes = [_white_modes(random, grid.size, grid.size // 2 + 1, grid.size) for _ in range(3)]
     moments = _fields((sum(f * m for f, m in zip(row, modes, strict=False)) for row in factors), 3, grid.size)
     ground, wavefronts = _draw_wavefronts(air, grid, seed, epoch)
-    return ExposureFields(common, SplineFields(grid.side, moments), ground, wavefronts)
+    return ExposureFields(common, SplineFields(grid.side, moments), by_optics, ground, wavefronts)
 
 
 @lru_cache(maxsize=4)
 def moment_spectrum(
     air: ExposedAir, response: MomentResponse, grid: FieldGrid
-) -> tuple[tuple[tuple[np.ndarray, ...], ...], np.ndarray]:
+) -> tuple[tuple[tuple[np.ndarray, ...], ...], np.ndarray, np.ndarray]:
     """Return lower Cholesky factors of the spectra of the moments on a grid, and that of what all stars share.
 
-    Factors of row i are i + 1 arrays [size, size // 2 + 1] [rad^2], with the gain of splines; the other is [3, 3].
+    Factors of row i are i + 1 arrays [size, size // 2 + 1] [rad^2], with the gain of splines; the other is [3, 3]. The
+    last result is the share of the variances that aberrations of the optics add, [3].
     """
     ends = 0.5 * math.sqrt(2.0) * grid.side
     highest = max(air.altitudes, default=0.0)
@@ -149,7 +154,8 @@ def moment_spectrum(
     lags = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     # The first ring is the lag zero.
     lags = np.concatenate([lags[0, :1], lags[1:].reshape(-1, 2)])
-    covariances = moment_covariance(air, lags).total(response)
+    of_orders = moment_covariance(air, lags, response.aberration)
+    covariances, by_optics = of_orders.total(response), of_orders.parts(response)[2, 0]
     polar = np.concatenate([np.repeat(covariances[:1], _SPOKES, axis=0), covariances[1:]]).reshape(_RINGS, _SPOKES, 6)
     # What stars half a period apart share, all stars do.
     shared = _positive(as_matrices(polar[np.searchsorted(radius, 0.5 * grid.side)].mean(axis=0)))
@@ -167,7 +173,8 @@ def moment_spectrum(
         ],
     )
     spectra = np.ascontiguousarray(scipy.fft.rfft2(covariance).real)
-    return _factors(spectra, scale), np.linalg.cholesky(shared + 1e-12 * scale * np.eye(3))
+    share = by_optics / np.maximum(covariances[0, :3], 1e-12 * scale)
+    return _factors(spectra, scale), np.linalg.cholesky(shared + 1e-12 * scale * np.eye(3)), share
 
 
 def _factors(spectra: np.ndarray, scale: float) -> tuple[tuple[np.ndarray, ...], ...]:
@@ -215,8 +222,14 @@ def _positive(matrix: np.ndarray) -> np.ndarray:
 
 
 def _spline_gain(size: int) -> np.ndarray:
-    """Return the gain of splines along one axis, for the frequencies of a transform, float32, [size]."""
-    return stencil_gain(2.0 * np.pi * np.fft.fftfreq(size), np.zeros(()), "spline").astype(np.float32)
+    """Return the gain along one axis that offsets smoothing by splines, for the frequencies of a transform, [size].
+
+    It makes the mean square of a mode right over all places, where it would be too small with splines that pass through
+    the samples: without a gain it is that of a spline of the seventh degree at its samples.
+    """
+    k = 2.0 * np.pi * np.fft.fftfreq(size)
+    mean_square = (1208.0 + 1191.0 * np.cos(k) + 120.0 * np.cos(2.0 * k) + np.cos(3.0 * k)) / 2520.0
+    return (1.0 / np.sqrt(mean_square)).astype(np.float32)
 
 
 def _grid_size(pupils: float, samples: float) -> int:

@@ -14,8 +14,8 @@ wp.set_module_options(FORWARD_OPTIONS)
 #: Baselines in one packet.
 LANES = 16
 baselines = wp.types.vector(LANES, wp.float32)
-#: Averages of one delay: slope covariances a, b, c, and their products of the second, fourth and sixth order.
-TERMS = 15
+#: Averages of one delay: slope covariances a, b, c, and their products of the second, fourth, sixth and third order.
+TERMS = 18
 delay_terms = wp.types.vector(TERMS, wp.float64)
 #: Number of slope covariances among them.
 SLOPES = wp.constant(3)
@@ -28,7 +28,7 @@ _BASELINE_LOOP = f"""
     const int last = isotropic.shape[0] - 1;
     packet sum[{TERMS}] = {{}};
     for (int k = start; k < end; ++k) {{
-        const packet* point = (const packet*)baseline.data + 3 * k;
+        const packet* point = (const packet*)baseline.data + 4 * k;
         packet* shared = (packet*)ground.data + 3 * k;
         packet a = shared[0];
         packet b = shared[1];
@@ -84,6 +84,10 @@ _BASELINE_LOOP = f"""
         sum[12] += sixth + axes * of_sixth;
         sum[13] += sixth + bb * of_sixth;
         sum[14] += w * (mean + apart) * (same_way + 8.0f * product + across);
+        const packet third = 0.5f * point[3] * (a + c);
+        sum[15] += third * (mean + 3.0f * axes);
+        sum[16] += third * (mean + 3.0f * bb);
+        sum[17] += third * (mean + 2.0f * apart);
     }}
     wp::vec_t<{TERMS}, wp::float64> averages;
     for (int k = 0; k < {TERMS}; ++k) {{
@@ -141,14 +145,15 @@ def average_products(
     """Average products of slope covariances of two stars over pupil and delays, for one lag.
 
     Arguments: lag [lag, 2] of the stars' field slopes [rad]; delay [s] and its weight [delay]; packet_start [delay + 1]
-    of the packets of each delay; baseline [packet, 3] of the pupil: x, y [m], weight of sum 1; altitude, velocity,
-    weight of the layers; isotropic and directed: tables of the slopes' covariance, zero at the end; per_step: one over
-    their step [1/m]; farthest: distance of a layer's centre from which on none of its baselines is within the tables
-    [m]; common [delay, 15]: the terms of layers on the ground alone; where it is empty, these are computed too; ground
-    [packet, 3]: covariances a, b, c of these layers, which are computed with the terms, and zero before; place [lag,
-    layer, 3]: room; squares [lag, 12]: averages of pp, qq, ss, pq, ps, qs, and of the products of the fourth and of the
-    sixth order that act as p, q and s; terms [lag, delay, 3 or 15]: averages of a, b, c over the baselines, and where
-    there is room of the products that make the squares. p = xx - yy, q = 2 xy, s = xx + yy.
+    of the packets of each delay; baseline [packet, 4] of the pupil: x, y [m], weight of sum 1, and that times the
+    covariance of the optics' aberrations; altitude, velocity, weight of the layers; isotropic and directed: tables of
+    the slopes' covariance, zero at the end; per_step: one over their step [1/m]; farthest: distance of a layer's centre
+    from which on none of its baselines is within the tables [m]; common [delay, 18]: the terms of layers on the ground
+    alone; where it is empty, these are computed too; ground [packet, 3]: covariances a, b, c of these layers, which are
+    computed with the terms, and zero before; place [lag, layer, 3]: room; squares [lag, 15]: averages of pp, qq, ss,
+    pq, ps, qs, and of the products of the fourth, the sixth and the third order that act as p, q and s; terms [lag,
+    delay, 3 or 18]: averages of a, b, c over the baselines, and where there is room of the products that make the
+    squares. p = xx - yy, q = 2 xy, s = xx + yy.
     """
     item = first + wp.tid()
     of_ground = common.shape[0] == 0

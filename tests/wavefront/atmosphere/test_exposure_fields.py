@@ -28,10 +28,9 @@ def test_spectra_of_moments_have_the_covariances():
     the field, the most at no lag.
     """
     grid = FieldGrid.of(AIR, FIELD_RADIUS)
-    factors, shared = moment_spectrum(AIR, RESPONSE, grid)
-    gain = stencil_gain(
-        2 * np.pi * np.fft.rfftfreq(grid.size), 2 * np.pi * np.fft.fftfreq(grid.size)[:, None], "spline"
-    )
+    factors, shared, _ = moment_spectrum(AIR, RESPONSE, grid)
+    gain = exposure_fields._spline_gain(grid.size)
+    gain = gain[:, None] * gain[: grid.size // 2 + 1]
     plain = [[f / gain for f in row] for row in factors]
     steps = np.array([(0, 0), (1, 0), (3, 2), (-2, 7), (12, 0), (0, 25)])
     theory = as_matrices(moment_covariance(AIR, steps * grid.side / grid.size).total(RESPONSE))
@@ -48,11 +47,11 @@ def test_spectra_of_moments_have_the_covariances():
 def test_half_variograms_between_samples():
     """Differences of drawn moments at places between samples, at a third of the pupil's angle and more.
 
-    The grid and its splines take 5 % away at the first lag and 4 % beyond; 64 exposures have a standard error of 1 %.
-    With three samples in that angle 16 % are missing at the first lag.
+    64 exposures have a standard error of 1 %; the first lag, of one and a half samples, has 3 to 5 % too much. With
+    amplitudes that are right at the samples 5 % are missing there and 4 % beyond.
     """
     grid = FieldGrid.of(AIR, FIELD_RADIUS)
-    factors, _ = moment_spectrum(AIR, RESPONSE, grid)
+    factors, _, _ = moment_spectrum(AIR, RESPONSE, grid)
     angle = AIR.diameter / max(AIR.altitudes)
     lags = angle * np.array([[0.33, 0.0], [0.0, 0.33], [0.66, 0.0], [0.0, 0.66], [1.5, 0.0], [0.0, 1.5]])
     covariance = moment_covariance(AIR, np.concatenate([np.zeros((1, 2)), lags])).total(RESPONSE)[:, :3]
@@ -66,8 +65,8 @@ def test_half_variograms_between_samples():
         values = fields.at(places)
         squares += [((fields.at(places + lag) - values) ** 2).mean(axis=0) for lag in lags]
     ratio = (squares / 128 / (covariance[0] - covariance[1:])).reshape(3, 2, 3).mean(axis=1)
-    assert ratio[0] == pytest.approx(np.ones(3), abs=0.08)
-    assert ratio[1:] == pytest.approx(np.ones((2, 3)), abs=0.06)
+    assert ratio[0] == pytest.approx(np.ones(3), abs=0.06)
+    assert ratio[1:] == pytest.approx(np.ones((2, 3)), abs=0.03)
 
 
 def test_modes_are_those_of_white_noise():
@@ -100,20 +99,25 @@ def test_mean_wavefronts_have_their_covariances(altitudes, side):
     weights = tuple(float(a == altitude) for a in altitudes)
     air = AIR._replace(altitudes=altitudes, weights=weights, velocities=((-4.0, 9.0),) * len(altitudes))
     grid = FieldGrid(512, side)
-    ground, fields = exposure_fields._draw_wavefronts(air, grid, 3, 0)
-    assert not ground.any()
-    drawn = ExposureFields(np.zeros(3), fields[0], ground, fields)
     stars = np.random.default_rng(1).uniform(0, side, (20_000, 2))
     lag = np.array([3.0, 1.0]) / altitude
-    here, there = drawn.wavefronts_at(stars), drawn.wavefronts_at(stars + lag)
     theory = mean_wavefront_covariance(air, [(0.0, 0.0), lag], NOLL, air.diameter, air.obscuration)
     sigma = np.sqrt(np.diag(theory[0, :, 0]))
     scale = np.outer(sigma, sigma)
-    # 750 m of a layer, 8 m across and 50 m along the wind for each independent patch: some 1400, three standard errors;
-    # of the low one 400 m. Modes that are left out are made up for by longer ones.
+    covariance = np.zeros((2, len(NOLL), len(NOLL)))
+    for seed in range(3):
+        ground, fields = exposure_fields._draw_wavefronts(air, grid, seed, 0)
+        assert not ground.any()
+        drawn = ExposureFields(np.zeros(3), fields[0], np.zeros(3), ground, fields)
+        here, there = drawn.wavefronts_at(stars), drawn.wavefronts_at(stars + lag)
+        covariance += np.array([here.T @ here, here.T @ there]) / (3 * len(stars) * scale)
+    # 750 m of a layer, 8 m across and 50 m along the wind for each independent patch: some 4200, two standard errors,
+    # beside 0.09 by modes that are left out and made up for by longer ones; of the low one 400 m.
     bound = 0.12 * 750.0 / (side * altitude)
-    assert here.T @ here / len(stars) / scale == pytest.approx(theory[0, :, 0] / scale, abs=bound)
-    assert here.T @ there / len(stars) / scale == pytest.approx(theory[0, :, 1] / scale, abs=bound)
+    assert covariance[0] == pytest.approx(theory[0, :, 0] / scale, abs=bound)
+    assert covariance[1] == pytest.approx(theory[0, :, 1] / scale, abs=bound)
+    # The variances themselves are closer.
+    assert np.diag(covariance[0]) == pytest.approx(np.ones(len(NOLL)), abs=0.5 * bound)
 
 
 def test_longer_modes_make_up_for_those_left_out():

@@ -143,12 +143,16 @@ def test_against_sums_over_a_small_pupil(lag):
 def test_higher_orders_against_sums_over_a_small_pupil(lag):
     """Parts of (n.S n')^N/N! that go as cos 2phi, sin 2phi and no angle, by sums over six directions each.
 
-    At N = 2 these are the moments of the second order, p and q by a factor of 64, s of 16.
+    At N = 2 these are the moments of the second order, p and q by a factor of 64, s of 16. A slope of the optics in any
+    direction, of covariance C, takes the place of one of four: (n.S n')^3/3! n.n' C/2.
     """
     points, times = pupil_points(0.25), AIR.exposure * (np.arange(40) + 0.5) / 40
+    aberration = np.array([3.0, 1.0, -1.0, -2.0]) * ARCSEC**2
+    distance = np.hypot(*(points[:, None] - points).T)
+    of_optics = np.tile(np.interp(distance, AIR.diameter * np.arange(4) / 3, aberration), (len(times), len(times)))
     slopes = between_stars(lag, points, times)
     angles = np.pi * np.arange(6) / 6
-    means = np.zeros((3, 3))
+    means = np.zeros((4, 3))
     for phi in angles:
         along = slopes @ [np.cos(phi), np.sin(phi)]
         for psi in angles:
@@ -156,7 +160,8 @@ def test_higher_orders_against_sums_over_a_small_pupil(lag):
             factors = np.array([np.cos(2 * phi) * np.cos(2 * psi), np.sin(2 * phi) * np.sin(2 * psi), 0.25]) * 64 / 36
             for row, order in enumerate((2, 4, 6)):
                 means[row] += factors * np.mean(projected**order) / math.factorial(order)
-    covariance = moment_covariance(AIR, np.array([lag]))
+            means[3] += factors * np.mean(projected**3 * of_optics) * np.cos(phi - psi) / 12
+    covariance = moment_covariance(AIR, np.array([lag]), tuple(aberration))
     got = np.array([covariance.second[0, :3], *covariance.higher[:, 0]])
     # The mean slope, which takes a part of the second order, is left in these sums.
     assert got[1:] == pytest.approx(means[1:], rel=0.03)
