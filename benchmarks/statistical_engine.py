@@ -295,40 +295,35 @@ def times(options):
     few = fields[:: max(1, len(fields) // 200)]
     waves = {1: [620e-9], 5: np.linspace(545e-9, 703e-9, 5)}
     for count, wavelengths in waves.items():
-        seconds = {"fast": [], "statistical, first": [], "statistical": [], "moments": []}
+        seconds = {"fast": [], "stamps": [], "shapes": [], "fields": []}
         with_screens = pachon.Atmosphere.from_site("cerro_pachon", 3)
         start = time.process_time()
         with_screens.screens("slopes", threads=1)
         made = time.process_time() - start
-        for epoch in range(1 + options.repeats):
-            # Each epoch has its own winds: nothing of the statistics of another is of use.
-            air = pachon.Atmosphere.from_site("cerro_pachon", 3, epoch=10 * count + epoch)
-            arguments = {"focal_plane": plane, "threads": 1}
-            by_engine = partial(pachon.make_psfs, telescope, wavelengths=wavelengths, **arguments)
-            shapes_alone = partial(pachon.psf_moments, telescope, wavelengths=wavelengths, **arguments)
-            for name, engine, places, call in (
+        arguments = {"wavelengths": wavelengths, "focal_plane": plane, "threads": 1}
+        by_engine, shapes_alone = partial(pachon.make_psfs, telescope), partial(pachon.psf_moments, telescope)
+        for visit in range(1 + options.repeats):
+            for n, (name, engine, places, call) in enumerate((
                 ("fast", "fast", few, by_engine),
-                ("statistical, first", "statistical", fields[:1], by_engine),
-                ("statistical", "statistical", fields, by_engine),
-                ("moments", "statistical", fields, shapes_alone),
-            ):
+                ("stamps", "statistical", fields, by_engine),
+                ("shapes", "statistical", fields, shapes_alone),
+                ("fields", "statistical", fields[:1], shapes_alone),
+            )):  # fmt: skip
+                # Each has its own winds: nothing of the statistics of another is of use.
+                air = pachon.Atmosphere.from_site("cerro_pachon", 3, epoch=1000 * count + 10 * visit + n)
                 start = time.process_time()
-                call(places, engine=engine, atmosphere=with_screens if engine == "fast" else air)
-                spent = time.process_time() - start
-                if epoch:
-                    seconds[name].append(spent / len(places) if name != "statistical, first" else spent)
+                call(places, engine=engine, atmosphere=with_screens if engine == "fast" else air, **arguments)
+                if visit:
+                    seconds[name].append(time.process_time() - start)
         with_screens.release()
-        star = {name: float(np.median(values)) for name, values in seconds.items()}
-        visit = 189 * 60
-        # Winds of each exposure are its own: screens and fields belong to a visit.
-        by_screens, first = visit * star["fast"], star["statistical, first"]
-        print(f"{count} wavelengths, pachon {pachon.__version__}: fast {1e6 * star['fast']:.0f} us a star, statistical"
-              f" {1e6 * star['statistical']:.0f}, shapes alone {1e6 * star['moments']:.0f}; screens {made:.1f} s,"
-              f" fields of an exposure {first:.2f} s", flush=True)  # fmt: skip
-        for name, key in (("stamps", "statistical"), ("shapes", "moments")):
-            spent = visit * star[key] + first
-            print(f"  a visit of {visit} {name}: {spent:.1f} s; fast / statistical {(made + by_screens) / spent:.1f}"
-                  f" with its screens, {by_screens / spent:.1f} without", flush=True)  # fmt: skip
+        spent = {name: float(np.median(values)) for name, values in seconds.items()}
+        by_screens = len(fields) * spent["fast"] / len(few)
+        print(f"{count} wavelengths, pachon {pachon.__version__}: fast {1e6 * spent['fast'] / len(few):.0f} us a star,"
+              f" screens {made:.1f} s; fields of an exposure {spent['fields']:.2f} s", flush=True)  # fmt: skip
+        for name in ("stamps", "shapes"):
+            print(f"  a visit of {len(fields)} {name}: {spent[name]:.2f} s; fast / statistical"
+                  f" {(made + by_screens) / spent[name]:.1f} with its screens, {by_screens / spent[name]:.1f} without",
+                  flush=True)  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ _SAMPLES = 4.5
 _MOST_SAMPLES = 2048
 _LEAST_SAMPLES = 16
 #: Rings and spokes of lags, between which covariances are interpolated.
-_RINGS = 22
+_RINGS = 18
 _SPOKES = 20
 #: First scale of the rings, in the angle of the pupil at the highest layer.
 _FIRST_RING = 0.3
@@ -53,7 +53,7 @@ _LAST = 16.0
 _TABLE = 8192
 #: Samples of these fields in the angle of the pupil at their highest layer: more than two a mode, which splines would
 #: weaken by a half.
-_WAVEFRONT_SAMPLES = 5.0
+_WAVEFRONT_SAMPLES = 4.5
 #: Steps of the tables up to the modes that are drawn.
 _DRAWN = round(_TABLE * _HIGHEST / _LAST)
 #: Factor of modes without frequency along x, and with the highest one: the inverse transform takes the mean of those at
@@ -161,10 +161,11 @@ def moment_spectrum(
     shared = _positive(as_matrices(polar[np.searchsorted(radius, 0.5 * grid.side)].mean(axis=0)))
     scale = float(polar[0, 0, 2])
     constant = np.array([shared[i, j] for i, j in PAIRS])
-    covariance = np.empty((6, grid.size, grid.size), dtype=np.float32)
+    half = grid.size // 2 + 1
+    covariance = np.empty((6, half, grid.size), dtype=np.float32)
     launch(
         spread_over_grid,
-        grid.size // 2 + 1,
+        half,
         [
             warp_array((polar - constant) / scale, pairs),
             grid.side / grid.size / unit,
@@ -172,7 +173,8 @@ def moment_spectrum(
             warp_array(covariance, wp.float32),
         ],
     )
-    spectra = np.ascontiguousarray(scipy.fft.rfft2(covariance).real)
+    # Opposite lags have equal covariances: transforms of opposite rows are conjugates, and the spectra are real.
+    spectra = scipy.fft.hfft(scipy.fft.rfft(covariance), grid.size, axis=1, overwrite_x=True)
     share = by_optics / np.maximum(covariances[0, :3], 1e-12 * scale)
     return _factors(spectra, scale), np.linalg.cholesky(shared + 1e-12 * scale * np.eye(3)), share
 

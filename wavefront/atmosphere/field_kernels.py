@@ -37,14 +37,14 @@ def spread_over_grid(
     step: wp.float32,
     grid: wp.array3d(dtype=wp.float32),
 ):
-    """Interpolate covariances from rings and spokes of lags to one row of a periodic grid, and to its opposite.
+    """Interpolate covariances from rings and spokes of lags to one row of a periodic grid.
 
     Arguments: polar [ring, spoke]: rings at exp(step k) - 1 in units of the first scale, spokes evenly over half a
     turn, after which the covariances are the same; per_spacing: spacing of the grid in that unit; grid [pair, row,
-    column], whose rows 0 to n/2 are the items.
+    column] of rows 0 to n/2, to whose opposites the others are equal.
     """
     row = first + wp.tid()
-    size = grid.shape[1]
+    size = grid.shape[2]
     n_ring = polar.shape[0]
     n_spoke = polar.shape[1]
     y = per_spacing * wp.float32(row)
@@ -66,7 +66,6 @@ def spread_over_grid(
                 value = value + along[i] * around[j] * polar[k, m]
         for pair in range(6):
             grid[pair, row, column] = value[pair]
-            grid[pair, (size - row) % size, (size - column) % size] = value[pair]
 
 
 @wp.func

@@ -59,6 +59,8 @@ _DRIFT = 1.4
 _NEAR_DRIFT = 0.5
 # Drift up to which delays count as near zero [m]: peaks of the slopes' covariance are narrower.
 _NEAR = 8.0
+# Distance from the pupil's rim from which on the slopes of a layer, a hundredth of theirs, vary little over it [m].
+_DISTANT = 8.0
 # Fewest delays on either side of zero.
 _LEAST_DELAYS = 64
 # Steps of the shift of the lattice, in parts of its spacing: of the plastic number (Roberts 2018), which fill a square
@@ -230,9 +232,9 @@ def _averages(
             warp_array(air.altitudes),
             warp_array(np.array(air.velocities, dtype=np.float64).reshape(-1, 2)),
             warp_array(air.weights, wp.float32),
-            warp_array(table.isotropic / _MICRO**2, wp.float32),
-            warp_array(table.directed / _MICRO**2, wp.float32),
+            warp_array(np.stack([table.isotropic, table.directed], axis=1) / _MICRO**2, wp.vec2f),
             1.0 / table.step,
+            air.diameter + min(_DISTANT, table.reach),
             air.diameter + table.reach,
             warp_array(common),
             warp_array(ground, baselines),

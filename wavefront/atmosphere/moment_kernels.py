@@ -25,14 +25,15 @@ pair_products = wp.types.vector(6, wp.float64)
 _BASELINE_LOOP = f"""
     #pragma clang fp contract(fast)
     typedef float packet __attribute__((vector_size({4 * LANES}), aligned(4)));
-    const int last = isotropic.shape[0] - 1;
+    const int last = table.shape[0] - 1;
+    const float* knots = (const float*)table.data;
     packet sum[{TERMS}] = {{}};
     for (int k = start; k < end; ++k) {{
         const packet* point = (const packet*)baseline.data + 4 * k;
         packet* shared = (packet*)ground.data + 3 * k;
-        packet a = shared[0];
-        packet b = shared[1];
-        packet c = shared[2];
+        packet a = shared[0] + distant.c[0];
+        packet b = shared[1] + distant.c[1];
+        packet c = shared[2] + distant.c[2];
         for (int n = 0; n < active; ++n) {{
             const float* center = place.data + 3 * n;
             const packet x = point[0] - center[0];
@@ -45,8 +46,8 @@ _BASELINE_LOOP = f"""
             for (int i = 0; i < {LANES}; ++i) {{
                 const int nearest = (int)(__builtin_sqrtf(squares[i]) * per_step + 0.5f);
                 const int knot = nearest < last ? nearest : last;
-                from_isotropic[i] = isotropic.data[knot];
-                from_directed[i] = directed.data[knot];
+                from_isotropic[i] = knots[2 * knot];
+                from_directed[i] = knots[2 * knot + 1];
             }}
             packet same = *(packet*)from_isotropic, other = *(packet*)from_directed;
             same = center[2] * same;
@@ -109,16 +110,26 @@ def average_over_baselines(
     of_ground: bool,
     place: wp.array2d(dtype=wp.float32),
     active: wp.int32,
-    isotropic: wp.array(dtype=wp.float32),
-    directed: wp.array(dtype=wp.float32),
+    distant: wp.vec3f,
+    table: wp.array(dtype=wp.vec2f),
     per_step: wp.float32,
 ) -> delay_terms:
     """Average slope covariances and their products over the baselines of one delay, packets start to end.
 
     Arguments, beside those of :func:`average_products`: whether to store the covariances as those of the ground; place
-    [layer, 3] of the first, active layers: x, y of their centres [m], and weights.
+    [layer, 3] of the first, active layers: x, y of their centres [m], and weights; distant: a, b, c of the others.
     """
     ...
+
+
+@wp.func
+def slopes_apart(x: wp.float32, y: wp.float32, table: wp.array(dtype=wp.vec2f), per_step: wp.float32):
+    """Covariances a, b, c of the slopes of points x, y [m] apart."""
+    knot = wp.min(wp.int32(wp.sqrt(x * x + y * y) * per_step + wp.float32(0.5)), table.shape[0] - 1)
+    same = table[knot][0]
+    other = table[knot][1]
+    difference = other * (x * x - y * y)
+    return wp.vec3f(same + difference, wp.float32(2.0) * other * x * y, same - difference)
 
 
 @wp.kernel
@@ -132,9 +143,9 @@ def average_products(
     altitude: wp.array(dtype=wp.float64),
     velocity: wp.array2d(dtype=wp.float64),
     weight: wp.array(dtype=wp.float32),
-    isotropic: wp.array(dtype=wp.float32),
-    directed: wp.array(dtype=wp.float32),
+    table: wp.array(dtype=wp.vec2f),
     per_step: wp.float32,
+    distant: wp.float64,
     farthest: wp.float64,
     common: wp.array2d(dtype=wp.float64),
     ground: wp.array2d(dtype=baselines),
@@ -146,9 +157,10 @@ def average_products(
 
     Arguments: lag [lag, 2] of the stars' field slopes [rad]; delay [s] and its weight [delay]; packet_start [delay + 1]
     of the packets of each delay; baseline [packet, 4] of the pupil: x, y [m], weight of sum 1, and that times the
-    covariance of the optics' aberrations; altitude, velocity, weight of the layers; isotropic and directed: tables of
-    the slopes' covariance, zero at the end; per_step: one over their step [1/m]; farthest: distance of a layer's centre
-    from which on none of its baselines is within the tables [m]; common [delay, 18]: the terms of layers on the ground
+    covariance of the optics' aberrations; altitude, velocity, weight of the layers; table of the slopes'
+    covariance, isotropic and directed, zero at the end; per_step: one over its step [1/m]; distant: distance of a
+    layer's centre from which on the covariance there stands for all baselines [m]; farthest: that from which on none
+    of its baselines is within the table; common [delay, 18]: the terms of layers on the ground
     alone; where it is empty, these are computed too; ground [packet, 3]: covariances a, b, c of these layers, which are
     computed with the terms, and zero before; place [lag, layer, 3]: room; squares [lag, 15]: averages of pp, qq, ss,
     pq, ps, qs, and of the products of the fourth, the sixth and the third order that act as p, q and s; terms [lag,
@@ -161,16 +173,24 @@ def average_products(
     total = delay_terms()
     for t in range(delay.shape[0]):
         active = wp.int32(0)
+        within = wp.int32(0)
+        of_distant = wp.vec3f()
         for n in range(altitude.shape[0]):
             center_x = altitude[n] * lag[item, 0] + velocity[n, 0] * delay[t]
             center_y = altitude[n] * lag[item, 1] + velocity[n, 1] * delay[t]
-            apart = altitude[n] > wp.float64(0.0) or of_ground
-            if apart and center_x * center_x + center_y * center_y < farthest * farthest:
-                place[item, active, 0] = wp.float32(center_x)
-                place[item, active, 1] = wp.float32(center_y)
-                place[item, active, 2] = weight[n]
-                active = active + 1
-        if active == 0 and not of_ground:
+            squared = center_x * center_x + center_y * center_y
+            if (altitude[n] > wp.float64(0.0) or of_ground) and squared < farthest * farthest:
+                within = within + 1
+                if squared < distant * distant:
+                    place[item, active, 0] = wp.float32(center_x)
+                    place[item, active, 1] = wp.float32(center_y)
+                    place[item, active, 2] = weight[n]
+                    active = active + 1
+                else:
+                    of_distant = of_distant + weight[n] * slopes_apart(
+                        wp.float32(center_x), wp.float32(center_y), table, per_step
+                    )
+        if within == 0 and not of_ground:
             for k in range(TERMS):
                 averages[k] = common[t, k]
         else:
@@ -182,8 +202,8 @@ def average_products(
                 of_ground,
                 place[item],
                 active,
-                isotropic,
-                directed,
+                of_distant,
+                table,
                 per_step,
             )
         total = total + delay_weight[t] * averages

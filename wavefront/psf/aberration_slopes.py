@@ -13,8 +13,8 @@ from .engine import PsfInputs
 # Rings of equal area of the field and of the pupil, and points on each.
 _FIELD_RINGS = 2
 _FIELD_ANGLES = 5
-_PUPIL_RINGS = 8
-_PUPIL_ANGLES = 16
+_PUPIL_RINGS = 6
+_PUPIL_ANGLES = 12
 # Steps of the distance of two points of the pupil, up to its diameter.
 _STEPS = 12
 

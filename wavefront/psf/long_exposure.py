@@ -39,6 +39,7 @@ import numpy as np
 import warp as wp
 
 from ...core.arguments import check_arguments
+from ...core.buffers import empty
 from ...core.errors import DomainError
 from ...core.launch import launch
 from ...core.units import field_label, require_count
@@ -411,7 +412,7 @@ class LongExposureRenderer(PsfRenderer):
         n_wave, depths = len(self._wavelengths), channels.depths
         # Place and light of the points, cut and lean of the strips along the rims.
         shapes = (n_wave * depths, 2, n_point), (n_point,), (2 * pupil.n_spoke, 3), (n_wave, 2 * pupil.n_spoke, 2)
-        points = [wp.empty((n_star, *shape), dtype=wp.float32, device="cpu") for shape in shapes]
+        points = [warp_array(empty((n_star, *shape), np.float32), wp.float32) for shape in shapes]
         launch(
             place_points,
             n_star * pupil.n_spoke,
@@ -433,9 +434,8 @@ class LongExposureRenderer(PsfRenderer):
             ],
             threads=self._threads,
         )
-        along_x = np.empty((n_star, n_packet, depths * n_point, 2, LANES), dtype=np.float32)
-        along_y = np.empty_like(along_x)
-        spectrum = np.empty((n_star, 4, n_row, n_packet, LANES), dtype=np.float32)
+        along_x, along_y = (empty((n_star, n_packet, depths * n_point, 2, LANES), np.float32) for _ in range(2))
+        spectrum = empty((n_star, 4, n_row, n_packet, LANES), np.float32)
         launch(
             transform_pupils,
             n_star,

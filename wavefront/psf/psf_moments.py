@@ -61,7 +61,7 @@ _NARROWEST = 0.5
 # Pixels of a stamp that is wider than any star.
 _WIDE_STAMP = 4096
 # Most stars of one batch.
-_BATCH = 1024
+_BATCH = 4096
 _MOST_STEPS = 60
 # Of the centroid, and the square root of moments, as a part of the weight's width: sums are float32.
 _TOLERANCE = 1e-5
@@ -240,7 +240,7 @@ class _Moments(LongExposureRenderer):
     def __init__(self, inputs: PsfInputs, options: Any, weight_rms: float) -> None:
         self._weight_angle = weight_rms
         super().__init__(inputs, options)
-        self.batch = min(_BATCH, 2 * self.batch)
+        self.batch = min(_BATCH, 4 * self.batch)
         # No light falls beside a stamp.
         self._inputs = replace(self._inputs, plane=replace(self._inputs.plane, size=_WIDE_STAMP))
 
