@@ -238,8 +238,8 @@ def _grid_size(pupils: float, samples: float) -> int:
     """Return an even number of samples with quick transforms, at least so many a pupil; DomainError if too many."""
     if samples * pupils > _MOST_SAMPLES:
         raise DomainError(
-            f"engine = 'statistical': the field under the highest layer is {pupils:.0f} pupils wide; "
-            f"expected at most {_MOST_SAMPLES / samples:.0f} ('fast' has no such limit)"
+            f"engine = 'statistical': the field under the highest layer is {pupils / _MARGIN:.0f} pupils wide; "
+            f"expected at most {_MOST_SAMPLES / samples / _MARGIN:.0f} ('fast' has no such limit)"
         )
     count = max(math.ceil(samples * pupils), _LEAST_SAMPLES)
     return 2 * int(scipy.fft.next_fast_len(-(-count // 2), real=True))

@@ -1,5 +1,7 @@
 """The statistical engine and moments without images: against images, Fourier kernels restated here and refusals."""
 
+import math
+
 import numpy as np
 import pytest
 import warp as wp
@@ -10,6 +12,7 @@ from pachon.core.launch import launch
 from pachon.core.units import ARCSEC
 from pachon.core.warp_arrays import warp_array
 from pachon.models.ideal_telescope import ideal_telescope
+from pachon.models.starting_designs.schmidt import schmidt
 from pachon.wavefront.psf import psf_moments
 from pachon.wavefront.psf.engines import psf_engine
 from pachon.wavefront.psf.psf import psf_inputs
@@ -197,6 +200,13 @@ def test_what_it_cannot_do_is_refused(lsst, air):
         pachon.psf_moments(lsst, FIELDS[:1], WAVE, engine="statistical")
     with pytest.raises(ConfigError, match="expected one of long_exposure, statistical"):
         pachon.psf_moments(lsst, FIELDS[:1], WAVE, atmosphere=air, engine="fast")
+
+
+def test_fields_too_wide_are_refused_in_pupils(air):
+    """Two degrees, in pupils of 0.9 m at 15.46 km."""
+    wide = schmidt(0.9, 2.5, field_radius=math.radians(1.0))
+    with pytest.raises(DomainError, match="600 pupils wide; expected at most 303"):
+        pachon.make_psfs(wide, [(0.0, 0.0)], WAVE, atmosphere=air, engine="statistical")
 
 
 @pytest.mark.long
