@@ -91,13 +91,17 @@ def measure_command(
         ),
     ] = "weight",
     mask: Annotated[str | None, Option(help="FITS file of the mask, or {stem}....")] = None,
-    gain: Annotated[float | None, Option(help="Electrons in a unit of the image, where the header has none.")] = None,
-    zero_point: Annotated[float | None, Option(help="Magnitude of a unit of the image.")] = None,
+    gain: Annotated[
+        float | None, Option(help="Electrons in a unit of the image; by default those of the header.")
+    ] = None,
+    zero_point: Annotated[
+        float | None, Option(help="Magnitude of a unit of the image; by default that of the header.")
+    ] = None,
     pixel_scale: Annotated[
         float | None, Option(help="Side of a pixel of an image without world coordinates [arcsec].")
     ] = None,
     saturation: Annotated[
-        float | None, Option(help="Level of saturated pixels [unit of the image], where the header has none.")
+        float | None, Option(help="Level of saturated pixels [unit of the image]; by default that of the header.")
     ] = None,
     pictures: Annotated[
         bool, Option("--pictures", help="Also image_measured.png: objects, stellar locus, stars beside their PSF.")

@@ -19,6 +19,7 @@ from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 from .errors import ConfigError, PachonError, ProductError
 from .files import parsing, read_bytes, text_lines, write_bytes
 from .products import Card, Columns, card_text
+from .units import metres, pure_numbers, radians
 
 #: Formats of astropy, or Parquet, by the ending of the file.
 FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits", ".parquet": "parquet"}
@@ -59,6 +60,31 @@ def read_columns(path: Path) -> dict[str, Column | np.ndarray]:
                 }
             table = Table.read(io.BytesIO(data), format=kind) if kind == "fits" else text_table(data, kind)
     return {name.lower(): table[name] for name in table.colnames}
+
+
+def column_in_unit(columns: Mapping[str, Any] | Table, name: str, unit: u.UnitBase | None) -> np.ndarray:
+    """Return a column in rad or m, or as it is without `unit`, that of a column that has none; NaN where masked.
+
+    Raises
+    ------
+    ProductError
+        If a row has more than one number, or the unit does not convert.
+    PachonError
+        If the column has no numbers.
+    """
+    column = columns[name]
+    if column.ndim != 1:
+        raise ProductError(f"column {name!r}: expected one number in every row")
+    numbers = pure_numbers(column.data if isinstance(column, Column) else column, f"column {name}")
+    if unit is None:
+        return numbers
+    column_unit = getattr(column, "unit", None)
+    if isinstance(column_unit, u.UnrecognizedUnit):  # "DEG", "degrees"
+        column_unit = u.Unit(str(column_unit).lower().removesuffix("s"), parse_strict="silent")
+    if isinstance(column_unit, u.UnrecognizedUnit):
+        raise ProductError(f"column {name!r} in {column_unit}: expected a unit that converts to {unit}")
+    quantity = u.Quantity(numbers, column_unit or unit)
+    return metres(quantity, f"column {name}") if unit == u.m else radians(quantity, f"column {name}")
 
 
 def text_table(data: bytes, kind: str = "ascii.csv") -> Table:

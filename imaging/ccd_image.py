@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ..core.errors import ConfigError, PachonError, error_context
+from ..core.errors import ConfigError, DomainError, PachonError
 from ..core.files import write_bytes
 from ..core.products import Stamp
 from ..pipeline.experiment import Experiment
@@ -96,8 +96,12 @@ def exposure_of(config: ImagesConfig, experiment: Experiment) -> Exposure:
     settings = {"sky": image.sky_mag, "subtract_background": image.subtract_background, "noise": image.noise}
     if image.gain is not None:
         settings["gain"] = image.gain
-    with error_context(key="image"):
+    try:
         return Exposure.of_run(experiment, image.exposures, **settings)
+    except DomainError as error:
+        # The sky has another name there.
+        problem = error.problem.replace("sky =", "sky_mag =", 1)
+        raise DomainError(problem, key=error.key).within(key="image") from None
 
 
 def galaxies_of(config: ImagesConfig, experiment: Experiment) -> SkyGalaxies:

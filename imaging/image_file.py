@@ -145,7 +145,7 @@ class CcdImage(Result):
     def celestial(self, pixels: np.ndarray) -> np.ndarray:
         """Return right ascension and declination (ICRS) [deg], shape [n, 2], of pixels (x, y), shape [n, 2]."""
         wcs = self.wcs
-        if wcs.wcs.lng == 0 and wcs.wcs.radesys in ("ICRS", ""):
+        if wcs.wcs.lng == 0 and wcs.wcs.lngtyp.strip() == "RA" and wcs.wcs.radesys in ("ICRS", ""):
             return np.asarray(wcs.all_pix2world(pixels, 0))
         sky = wcs.celestial.pixel_to_world(*np.asarray(pixels, dtype=np.float64).T).icrs
         return np.stack([sky.ra.deg, sky.dec.deg], axis=1)
@@ -153,9 +153,11 @@ class CcdImage(Result):
     def pixels_at(self, celestial: np.ndarray) -> np.ndarray:
         """Return pixels (x, y), shape [n, 2], of right ascension and declination (ICRS) [deg], shape [n, 2].
 
-        NaN where the world coordinates have no inverse.
+        NaN where the world coordinates have no inverse, and for declinations beyond a pole.
         """
-        sky = SkyCoord(*np.asarray(celestial, dtype=np.float64).T, unit="deg")
+        right_ascension, declination = np.asarray(celestial, dtype=np.float64).T
+        declination = np.where(np.abs(declination) <= 90.0, declination, np.nan)
+        sky = SkyCoord(right_ascension, declination, unit="deg")
         with warnings.catch_warnings(), np.errstate(invalid="ignore"):
             warnings.simplefilter("ignore")
             return np.stack(self.wcs.celestial.world_to_pixel(sky), axis=1)

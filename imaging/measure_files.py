@@ -159,7 +159,7 @@ class FileMeasurement:
             catalogue.psf.write(product)
             table.meta["PSFHASH"] = content_hash(product, ProductError)
         if options.pictures:
-            write_bytes(self.product(source, PICTURE_SUFFIX).with_suffix(".png"), measured_png(catalogue))
+            write_bytes(self.picture(source), measured_png(catalogue))
         # Last: a resumed measurement takes it for the sign of a finished image.
         write_fits(self.product(source, CATALOGUE_SUFFIX), [fits.table_to_hdu(table)], None, [])
         return metrics
@@ -169,6 +169,10 @@ class FileMeasurement:
         extension = "" if source.extension is None else f"_{source.extension}"
         folder = source.path.parent if self.folder is None else self.folder
         return folder / f"{image_stem(source.path)}{extension}{suffix}.fits"
+
+    def picture(self, source: ImageSource) -> Path:
+        """Return the path of the picture of an image."""
+        return self.product(source, PICTURE_SUFFIX).with_suffix(".png")
 
     def digest(self, source: ImageSource) -> str:
         """Return the SHA-256 of all that decides the products of an image: its file, options, model, version."""
@@ -182,8 +186,11 @@ class FileMeasurement:
     def finished(self, source: ImageSource) -> dict[str, Any] | None:
         """Return the metrics of an image that is measured already, in the same way; None if a product is damaged.
 
-        The catalogue is checked by its FITS checksums, the PSF model beside it by the hash that the catalogue has.
+        The catalogue is checked by its FITS checksums, the PSF model beside it by the hash that the catalogue has. A
+        picture that is asked for must be there.
         """
+        if self.options.pictures and not self.picture(source).is_file():
+            return None
         try:
             _, table = read_fits(self.product(source, CATALOGUE_SUFFIX))
             if (

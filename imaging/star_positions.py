@@ -6,13 +6,14 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+from astropy import units as u
 from astropy.io import fits
 from astropy.table import Table
 
-from ..core.errors import DomainError, ProductError
+from ..core.errors import DomainError, ProductError, error_context
 from ..core.files import parsing, read_bytes
 from ..core.fits_files import open_fits
-from ..core.table_files import text_table
+from ..core.table_files import column_in_unit, text_table
 from .image_file import CcdImage
 
 #: Columns of pixels, the first one's centre at (0, 0), in small letters.
@@ -52,8 +53,9 @@ def positions_in(table: Table, image: CcdImage, path: Path) -> np.ndarray:
     """Return the pixels of an image at which the rows of a table of a file are, [n, 2]; ProductError without any."""
     columns = {name.lower(): name for name in table.colnames}
 
-    def values(names: tuple[str, str]) -> np.ndarray:
-        return np.stack([np.ma.filled(np.ma.asarray(table[columns[n]], dtype=float), np.nan) for n in names], axis=1)
+    def values(names: tuple[str, str], unit: u.UnitBase | None = None) -> np.ndarray:
+        with error_context(file=path):
+            return np.stack([column_in_unit(table, columns[name], unit) for name in names], axis=1)
 
     for pairs, first in ((_FROM_ONE, 1.0), (_FROM_ZERO, 0.0)):
         for names in pairs:
@@ -66,10 +68,7 @@ def positions_in(table: Table, image: CcdImage, path: Path) -> np.ndarray:
             raise ProductError(
                 f"has {' and '.join(names)}, the image no world coordinates: expected x and y", file=path
             )
-        units = [str(table[columns[name]].unit or "").lower() for name in names]
-        in_radian = all(unit in ("rad", "radian") or (not unit and names == _CELESTIAL_RADIAN) for unit in units)
-        sky = np.rad2deg(values(names)) if in_radian else values(names)
-        return image.pixels_at(sky)
+        return image.pixels_at(np.rad2deg(values(names, u.rad if names == _CELESTIAL_RADIAN else u.deg)))
     expected = ", ".join(" and ".join(names) for names in (*_FROM_ZERO[:1], *_FROM_ONE[:1], *_CELESTIAL[:2]))
     raise ProductError(f"has no positions of stars: expected columns {expected}", file=path)
 

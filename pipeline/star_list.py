@@ -10,11 +10,9 @@ from typing import Any, Literal
 
 import numpy as np
 from astropy import units as u
-from astropy.table import Column
 
 from ..core.errors import ConfigError, ProductError, error_context
-from ..core.table_files import read_columns
-from ..core.units import metres, pure_numbers, radians
+from ..core.table_files import column_in_unit, read_columns
 from ..models.camera.camera import Camera
 from ..models.star_spectrum import COOLEST, HOTTEST, TEMPERATURE_COLUMNS, ColorBands, color_temperature
 from ..models.telescope import Telescope
@@ -216,15 +214,15 @@ def _read_rows(path: Path, columns: dict[str, str], band: str) -> _Rows:
             raise ProductError(
                 f"no column {', '.join(absent_keys)} ({looked}); columns are {', '.join(table) or 'none'}"
             )
-        magnitude = _column_in_unit(table, str(column_names["mag"]), None)
-        places = np.stack([_column_in_unit(table, str(column_names[key]), unit) for key in pair], axis=1)
+        magnitude = column_in_unit(table, str(column_names["mag"]), None)
+        places = np.stack([column_in_unit(table, str(column_names[key]), unit) for key in pair], axis=1)
         for key in _SPECTRA:
             if key in columns and column_names[key] is None:
                 raise ProductError(f"no column {columns[key]} ({key}); columns are {', '.join(table)}")
         spectrum = next((key for key in _SPECTRA if column_names[key]), None)
         kelvin = np.full(len(magnitude), np.nan)
         if spectrum is not None:
-            kelvin = _star_temperatures(_column_in_unit(table, str(column_names[spectrum]), None), spectrum)
+            kelvin = _star_temperatures(column_in_unit(table, str(column_names[spectrum]), None), spectrum)
     unused = tuple(name for name in _COLORS if name in table)
     return _Rows(pair[0], places, magnitude, kelvin, spectrum, unused)
 
@@ -258,18 +256,3 @@ def _column_names(key: str, columns: dict[str, str], band: str) -> tuple[str, ..
 def _column_name(table: dict[str, Any], key: str, columns: dict[str, str], band: str) -> str | None:
     """Return the name of a column in a table, or None."""
     return next((name for name in _column_names(key, columns, band) if name in table), None)
-
-
-def _column_in_unit(table: dict[str, Any], name: str, unit: u.UnitBase | None) -> np.ndarray:
-    """Return a column in rad or m, or as it is without `unit`, that of a column that has none; NaN where masked."""
-    column = table[name]
-    if column.ndim != 1:
-        raise ProductError(f"column {name!r}: expected one number in every row")
-    numbers = pure_numbers(column.data if isinstance(column, Column) else column, f"column {name}")
-    if unit is None:
-        return numbers
-    column_unit = getattr(column, "unit", None)
-    if isinstance(column_unit, u.UnrecognizedUnit):
-        raise ProductError(f"column {name!r} in {column_unit}: expected a unit that converts to {unit}")
-    quantity = u.Quantity(numbers, column_unit or unit)
-    return metres(quantity, f"column {name}") if unit == u.m else radians(quantity, f"column {name}")

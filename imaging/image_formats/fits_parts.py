@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +31,7 @@ class FitsPart:
     name: str  #: EXTNAME in capitals; empty where there is none
     header: fits.Header  #: of the primary part too, where the image lies in an extension
     image_shape: tuple[int, ...]  #: as NumPy has it; empty where there is no image
+    version: int = 1  #: EXTVER, which tells parts of one name apart
 
     @property
     def is_image(self) -> bool:
@@ -54,9 +55,17 @@ class FitsParts:
             parts = tuple(_part_of(index, hdu, primary) for index, hdu in enumerate(hdus))
         return cls(path, parts)
 
-    def named(self, *names: str) -> FitsPart | None:
-        """Return the first image of one of these names; None where there is none."""
-        return next((part for name in names for part in self.parts if part.is_image and part.name == name), None)
+    def named(self, *names: str) -> list[FitsPart]:
+        """Return the images of the first of these names that has any."""
+        images = ([part for part in self.parts if part.is_image and part.name == name] for name in names)
+        return next(filter(None, images), [])
+
+    def label(self, part: FitsPart) -> str:
+        """Return the name of an image; with its version, as in SCI,2, where others have it, too; else its number."""
+        versions = [image.version for image in self.named(part.name)]
+        if not part.name or versions.count(part.version) > 1:
+            return str(part.index)
+        return part.name if len(versions) == 1 else f"{part.name},{part.version}"
 
     def pixels(self, part: FitsPart) -> np.ndarray:
         """Return the pixels of an image in the machine's own byte order; ProductError where its checksum is wrong."""
@@ -67,6 +76,12 @@ class FitsParts:
         with _opened(self.path) as hdus:
             array = np.asarray(hdus[part.index].data)
             return np.array(array, dtype=array.dtype.newbyteorder("="))
+
+
+def beside(image: FitsPart, parts: Sequence[FitsPart]) -> FitsPart | None:
+    """Return the part that belongs to an image: the only one, or of its version the next one; None of none."""
+    same_version = parts if len(parts) == 1 else [part for part in parts if part.version == image.version]
+    return min(same_version, key=lambda part: (part.index < image.index, part.index), default=None)
 
 
 @contextmanager
@@ -90,4 +105,5 @@ def _part_of(index: int, hdu: fits.hdu.base.ExtensionHDU, primary: fits.Header) 
     for keyword in _STRUCTURE:
         header.remove(keyword, ignore_missing=True, remove_all=True)
     # fpack names a nameless image so.
-    return FitsPart(index, "" if name == "COMPRESSED_IMAGE" else name, header, tuple(shape))
+    name = "" if name == "COMPRESSED_IMAGE" else name
+    return FitsPart(index, name, header, tuple(shape), hdu.ver)

@@ -115,7 +115,7 @@ def image_sources(path: Path, extension: str | None = None) -> list[ImageSource]
     return [
         ImageSource(
             path,
-            (planes.image.name or str(planes.image.index)) if several else None,
+            file.label(planes.image) if several else None,
             _PLANE_BYTES * int(np.prod(planes.image.image_shape)),
         )
         for planes in images
@@ -139,7 +139,7 @@ def load_image(path: str | Path, *, extension: str | None = None, settings: Imag
     path : str or Path
         The file.
     extension : str, optional
-        Name or number of the extension, in a file of several images.
+        Name or number of the extension, in a file of several images; name and version, as ``SCI,2``, of equal names.
     settings : ImageSettings, optional
         Weight and mask in files of their own, gain, zero point, pixel scale, saturation.
 
@@ -161,7 +161,7 @@ def load_image(path: str | Path, *, extension: str | None = None, settings: Imag
         return CcdImage.read(path)
     images = planes_of(file, extension)
     if len(images) > 1:
-        names = ", ".join(planes.image.name or str(planes.image.index) for planes in images)
+        names = ", ".join(file.label(planes.image) for planes in images)
         raise ProductError(f"has {len(images)} images: expected extension = one of {names}", file=path, key="extension")
     return _image_of(file, images[0], settings)
 
@@ -224,7 +224,8 @@ def _image_of(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -> C
     header["SKYSUB"] = (False, "whether the background is subtracted")
     header["SKY"] = (float(np.median(sky.level)), "background, measured")
     mask = np.where(bad, BAD_BIT, 0) | np.where(defects.saturated & finite, SATURATED_BIT, 0)
-    name = part.name if part.name not in ("", "SCI", "IMAGE") else image_stem(path)
+    label = file.label(part)
+    name = image_stem(path) if label in ("SCI", "IMAGE") or not part.name else label
     return CcdImage(
         name,
         np.where(bad, sky.level, image).astype(np.float32),

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...core.errors import ProductError
 from ...core.number_text import counted
-from .fits_parts import FitsPart, FitsParts
+from .fits_parts import FitsPart, FitsParts, beside
 
 #: Planes of LSST's masks that mark an area or an object, and leave a pixel as good as any.
 _HARMLESS = frozenset(
@@ -90,26 +90,24 @@ def planes_of(file: FitsParts, extension: str | None) -> list[PlaneNames]:
     ProductError
         If there is no image, or no such one.
     """
-    noise = next(((part, kind) for name, kind in _NOISE_NAMES.items() if (part := file.named(name))), None)
-    mask = file.named(*_MASK_NAMES)
-    companions = {part.index for part in (noise[0] if noise else None, mask) if part is not None}
+    noise, masks = file.named(*_NOISE_NAMES), file.named(*_MASK_NAMES)
+    companions = {part.index for part in (*noise, *masks)}
     images = [part for part in file.parts if part.is_image and part.index not in companions]
     if not images:
         raise ProductError("has no image of two axes", file=file.path)
     if extension is not None:
-        names = ", ".join(part.name or str(part.index) for part in images)
-        images = [part for part in images if extension.upper() == part.name or extension == str(part.index)]
+        names = ", ".join(map(file.label, images))
+        named = [part for part in images if extension.upper() == part.name]
+        images = [part for part in images if extension.upper() in (file.label(part), str(part.index))] or named
         if not images:
             raise ProductError(f"extension = {extension}: expected one of {names}", file=file.path, key="extension")
-    beside = noise is not None or mask is not None
-    if beside and len(images) > 1:
+    if companions and len(images) > 1:
         # IMAGE or SCI is what the planes belong to; catalogues of LSST have small images of PSFs and transmissions.
         images = [part for part in images if part.name in ("IMAGE", "SCI")] or [
-            part for part in images if part.image_shape == (noise[0] if noise else images[0]).image_shape
+            part for part in images if part.image_shape == (noise or images)[0].image_shape
         ]
-    return [
-        PlaneNames(part, noise[0] if noise else None, noise[1] if noise else WeightKind.WEIGHT, mask) for part in images
-    ]
+    kind = _NOISE_NAMES[noise[0].name] if noise else WeightKind.WEIGHT
+    return [PlaneNames(part, beside(part, noise), kind, beside(part, masks)) for part in images]
 
 
 def companion_in(path: Path, image: FitsPart) -> tuple[FitsParts, FitsPart]:
@@ -128,7 +126,8 @@ def companion_in(path: Path, image: FitsPart) -> tuple[FitsParts, FitsPart]:
             f"has {counted(len(planes), 'image')}: expected one, or one called {image.name or 'as that of the image'}",
             file=path,
         )
-    return file, (same_name or planes)[0]
+    # The first one, where the file has no image of that version.
+    return file, beside(image, same_name or planes) or same_name[0]
 
 
 def defects_of(values: np.ndarray, part: FitsPart, path: Path) -> Defects:

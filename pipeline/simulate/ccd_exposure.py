@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from ...core.errors import DomainError
+from ...core.errors import ConfigError, DomainError
 from ...core.groups import slices_of
 from ...measure.shapes import measure_shapes
 from ...models.camera.camera import Camera
@@ -342,13 +342,21 @@ def ccd_stars(experiment: Experiment, name: str, width: float, least_light: floa
     config, camera, listed = experiment.config, experiment.camera, experiment.star_list
     band, exposure = experiment.band, config.atmosphere.exposure_s
     faint = limiting_magnitude(config.stars.snr_min, band, exposure, width) + 2.5 * np.log10(least_light)
+    depth = Depth(band, exposure, faint=faint)
+    try:
+        depth.limits(width)
+    except DomainError as error:
+        if error.key == "faint":
+            text = f"stars.snr_min = {config.stars.snr_min:g}: expected less: stars of magnitude {faint:.2f} saturate"
+            raise ConfigError(text, key="stars.snr_min") from None
+        raise
     drawn = make_star_field(
         ccd_outline(camera, name),
         config.stars.truth,
         config.stars.observed if listed is None else 0,
         config.seed,
         fwhm=width,
-        depth=Depth(band, exposure, faint=faint),
+        depth=depth,
         margin=_MARGIN,
     )
     if listed is None:

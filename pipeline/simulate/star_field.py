@@ -107,7 +107,7 @@ class Depth:
             faint = photometry.limiting_magnitude(self.snr, self.band, self.exposure, fwhm)
         if not bright < faint:
             text = f"bright = {bright:.2f}, faint = {faint:.2f}: expected a bright limit above the faint one"
-            raise DomainError(text)
+            raise DomainError(text, key="faint")
         return float(bright), float(faint)
 
 

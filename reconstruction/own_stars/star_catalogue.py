@@ -127,7 +127,7 @@ def load_stars(
         Column of the stamps, [ny, nx] in every row; VIGNET of SExtractor, IMAGE and DEBLENDED stand in for "stamp".
         Where a FITS file has none, its first image of three axes is taken.
     weight, mask : str, optional
-        Columns of weights (zero for pixels to ignore) and masks (not zero for pixels to ignore; where the header has
+        Columns of weights (zero for pixels to ignore) and masks (not zero or True for them; where the header has
         cards such as MP_BAD, the bits of bad planes, :data:`~.stamp_weights.BAD_PLANES`). Where nothing is said,
         columns WEIGHT, VIGNET_WEIGHT, VARIANCE, MASK and so on (:data:`OTHER_NAMES`), and images of three axes whose
         EXTNAME is one of these.
@@ -208,7 +208,8 @@ def load_stars(
     for kind, column in (("weight", weight), ("variance", None), ("mask", mask)):
         name = _find_column(kind if column is None else column, columns)
         if name is not None and (column is not None or columns[name].ndim == 3):
-            quality[kind] = _checked_column(path, name, columns[name], 3)
+            values = columns[name]
+            quality[kind] = _checked_column(path, name, values.astype(np.uint8) if values.dtype == bool else values, 3)
         else:
             quality[kind] = None if cube is None else _cube_named(cube_hdus, (kind, *OTHER_NAMES[kind]))
     return StarCutouts(
@@ -228,10 +229,14 @@ def load_stars(
 
 
 def _flags_column(columns: dict[str, np.ndarray]) -> np.ndarray | None:
-    """Return a column FLAGS of one whole number in every row; None without one."""
+    """Return a column FLAGS of one whole number in every row, 0 where there is none; None without such a column."""
     values = next((values for name, values in columns.items() if name.lower() == "flags"), None)
-    if values is None or values.dtype.kind not in "iu" or values.ndim != 1:
+    if values is None or values.dtype.kind not in "iuf" or values.ndim != 1:
         return None
+    if values.dtype.kind == "f":  # of a table in which some are masked
+        values = np.nan_to_num(values, nan=0.0)
+        if not (np.isfinite(values).all() and (values == np.rint(values)).all()):
+            return None
     return values.astype(np.int64)
 
 

@@ -175,7 +175,7 @@ def test_the_run_may_be_a_file(settings, tmp_path, capsys):
     [
         ({"image__exposures": 0}, [], "image.exposures = 0: expected"),
         ({"image__gain": -2.0}, [], "image.gain = -2.0: expected"),
-        ({"image__sky_mag": 8.0}, [], "image.sky = 8.00"),
+        ({"image__sky_mag": 8.0}, [], "image.sky_mag = 8.00"),
         ({"image__side": 5000}, [], "image.side = 5000: expected at most 4004"),
         ({"image__wey": "direct"}, [], "unknown key image.wey"),
         ({"galaxies__faintest": 12.0}, [], "galaxies.faintest = 12"),

@@ -12,6 +12,7 @@ from numpy.polynomial import chebyshev, legendre, polynomial
 import pachon
 from pachon.core.errors import ConfigError, PachonError, ProductError
 from pachon.core.units import ARCSEC
+from pachon.imaging.image_formats.load import image_sources
 
 SATURATED, BAD = 1, 2
 
@@ -134,6 +135,31 @@ def test_a_file_of_many_images(field, tmp_path):
     assert np.array_equal(pachon.load_image(tmp_path / "m.fits", extension="1").image, field.image)
     with pytest.raises(ProductError, match="extension = S5: expected one of N4, S4"):
         pachon.load_image(tmp_path / "m.fits", extension="S5")
+
+
+def test_images_of_one_name_have_the_planes_of_their_version(field, tmp_path):
+    # As in files of HST's cameras of two chips.
+    hdus = [fits.PrimaryHDU()]
+    for version in (1, 2):
+        mask = np.zeros(field.image.shape, dtype=np.int16)
+        mask[: 10 * version] = 4
+        rms = np.sqrt(field.variance * (1.0 + 0.1 * version))
+        hdus.append(fits.ImageHDU(field.image, header_of(), name="SCI", ver=version))
+        hdus.append(fits.ImageHDU(rms.astype(np.float32), name="ERR", ver=version))
+        hdus.append(fits.ImageHDU(mask, name="DQ", ver=version))
+    path = write(tmp_path / "chips.fits", *hdus)
+    with pytest.raises(ProductError, match=r"has 2 images: expected extension = one of SCI,1, SCI,2"):
+        pachon.load_image(path)
+    with pytest.raises(ProductError, match=r"extension = SCI,3: expected one of SCI,1, SCI,2"):
+        pachon.load_image(path, extension="SCI,3")
+    for extension, version in (("SCI,1", 1), ("sci,2", 2), ("4", 2)):
+        image = pachon.load_image(path, extension=extension)
+        assert image.name == f"SCI,{version}"
+        assert ((image.mask != 0).sum(axis=1) > 0).sum() == 10 * version
+        good = image.mask == 0
+        expected = (1.0 + 0.1 * version) * field.variance[good]
+        np.testing.assert_allclose(image.variance[good], expected, rtol=1e-5)
+    assert [source.extension for source in image_sources(path)] == ["SCI,1", "SCI,2"]
 
 
 def test_pixels_without_a_value_have_no_weight(field, tmp_path):
@@ -259,10 +285,10 @@ def test_world_coordinates_agree_with_galsim(field, tmp_path, kind):
         np.testing.assert_allclose(image.celestial(np.array([[x, y]]))[0], expected, atol=3e-10)
 
 
-def test_galactic_coordinates_and_swapped_axes(field, tmp_path):
+@pytest.mark.parametrize("axes", [{"GLAT-TAN": -20.0, "GLON-TAN": 120.0}, {"GLON-TAN": 120.0, "GLAT-TAN": -20.0}])
+def test_galactic_coordinates_and_swapped_axes(field, tmp_path, axes):
     header = header_of()
-    header["CTYPE1"], header["CTYPE2"] = "GLAT-TAN", "GLON-TAN"
-    header["CRVAL1"], header["CRVAL2"] = -20.0, 120.0
+    (header["CTYPE1"], header["CRVAL1"]), (header["CTYPE2"], header["CRVAL2"]) = axes.items()
     image = pachon.load_image(plain(tmp_path / "a.fits", field, header))
     from astropy.coordinates import SkyCoord
 

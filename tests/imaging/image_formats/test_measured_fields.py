@@ -291,6 +291,13 @@ def test_all_images_of_a_file(field, tmp_path, capsys):
     assert main(["measure", *map(str, sorted(tmp_path.glob("*.fits*"))), "--json", "--quiet", "--resume"]) == 0
     assert list(json.loads(capsys.readouterr().out)["images"]) == list(found["images"])
     assert {path: path.stat().st_mtime_ns for path in before} == before
+    # A picture that is missing is drawn, with --pictures.
+    picture = tmp_path / "exposure_N4_measured.png"
+    picture.unlink()
+    assert main([*command, "--resume"]) == 0
+    assert not picture.exists()
+    assert main([*command, "--resume", "--pictures"]) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
     # Another gain makes another catalogue.
     assert main([*command, "--resume", "--extension", "S4", "--gain", "2.4"]) == 0
     assert (tmp_path / "exposure_S4_galaxies.fits").stat().st_mtime_ns != before[tmp_path / "exposure_S4_galaxies.fits"]

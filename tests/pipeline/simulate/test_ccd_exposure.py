@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from pachon.core.errors import DomainError
+from pachon.core.errors import ConfigError, DomainError
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.simulate import ccd_loop
 from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_ccd, expose_ccds
@@ -71,3 +71,9 @@ def test_an_error_names_its_ccd_after_the_ccds_before_it(experiment, stars):
             threads=1,
         )
     assert modelled == [NAMES[0]]
+
+
+def test_a_signal_to_noise_ratio_of_saturated_stars_is_refused_by_its_key(tiny):
+    bright = Experiment.from_config(tiny(ccds=NAMES[:1], stars__snr_min=1e6))
+    with pytest.raises(ConfigError, match=r"^stars\.snr_min = 1e\+06: expected less: stars of magnitude .* saturate$"):
+        ccd_stars(bright, NAMES[0], PROVISIONAL_FWHM)

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.table import Table
+from astropy.table import MaskedColumn, Table
 
 from pachon.core.errors import ProductError
 from pachon.reconstruction.own_stars.star_catalogue import load_stars
@@ -102,15 +102,32 @@ def bad_pixels(count, seed=3):
     return bad
 
 
-@pytest.mark.parametrize("name", ["WEIGHT", "VIGNET_WEIGHT", "VARIANCE", "MASK", "wgt", "flagged"])
+@pytest.mark.parametrize("name", ["WEIGHT", "VIGNET_WEIGHT", "VARIANCE", "MASK", "masks", "weights", "wgt", "flagged"])
 def test_pixels_without_weight_are_no_numbers(tmp_path, name):
     stamps, positions = stars()
     bad = bad_pixels(len(stamps))
     values = {"VARIANCE": np.where(bad, np.inf, 4.0), "MASK": 8 * bad, "flagged": bad.astype(np.uint8)}
+    values |= {"masks": bad, "weights": ~bad}
     column = values.get(name, np.where(bad, 0.0, 0.25))
     options = {"wgt": {"weight": "WGT"}, "flagged": {"mask": "flagged"}}.get(name, {})
     path = catalogue(tmp_path / "stars.fits", stamps, positions, **{name: column})
     np.testing.assert_array_equal(load_stars(path, **options).stamps, np.where(bad, np.nan, stamps))
+
+
+@pytest.mark.parametrize("ending", ["fits", "ecsv"])
+def test_flags_that_are_masked_or_floats_are_read(tmp_path, ending):
+    stamps, positions = stars()
+    table = Table({"x": positions[:, 0], "y": positions[:, 1], "stamp": stamps})
+    flags = np.arange(len(stamps))
+    for column, expected in (
+        (flags.astype(float), flags),
+        (np.where(flags == 2, np.nan, flags), np.where(flags == 2, 0, flags)),
+        (flags + 0.5, None),
+        *([(MaskedColumn(flags, mask=flags == 2), np.where(flags == 2, 0, flags))] if ending == "ecsv" else []),
+    ):
+        table["FLAGS"] = column
+        table.write(tmp_path / f"stars.{ending}", overwrite=True)
+        np.testing.assert_array_equal(load_stars(tmp_path / f"stars.{ending}").flags, expected)
 
 
 def test_all_stars_in_one_row_as_in_files_of_piff(tmp_path):

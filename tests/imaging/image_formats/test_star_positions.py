@@ -1,0 +1,67 @@
+"""Positions of stars in a user's tables: units, unusable rows and columns."""
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.io import fits
+from astropy.table import Table
+from drawn_fields import header_of
+
+import pachon
+from pachon.core.errors import PachonError
+from pachon.imaging.star_positions import read_star_positions
+
+PIXELS = np.array([[30.0, 50.0], [200.25, 17.5], [111.0, 222.0]])
+
+
+@pytest.fixture(scope="module")
+def image(field, tmp_path_factory):
+    path = tmp_path_factory.mktemp("image") / "a.fits"
+    fits.PrimaryHDU(field.image, header_of()).writeto(path)
+    return pachon.load_image(path)
+
+
+@pytest.mark.parametrize(
+    ("ra_unit", "dec_unit", "ending"),
+    [
+        (u.deg, u.deg, "fits"),
+        (u.hourangle, u.deg, "ecsv"),
+        (u.arcsec, u.arcsec, "fits"),
+        (u.rad, u.deg, "fits"),
+        (u.mas, u.arcmin, "ecsv"),
+    ],
+)
+def test_angles_are_in_the_units_of_the_table(image, tmp_path, ra_unit, dec_unit, ending):
+    ra, dec = np.deg2rad(image.celestial(PIXELS)).T * u.rad
+    path = tmp_path / f"stars.{ending}"
+    Table({"ra": ra.to(ra_unit), "dec": dec.to(dec_unit)}).write(path)
+    np.testing.assert_allclose(read_star_positions(path, image), PIXELS, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["DEG", "degrees", "Degree"])
+def test_names_of_degrees(image, tmp_path, name):
+    sky = image.celestial(PIXELS).T
+    columns = [fits.Column(key, "D", unit=name, array=v) for key, v in zip(("RA", "DEC"), sky, strict=True)]
+    path = tmp_path / "stars.fits"
+    fits.BinTableHDU.from_columns(columns).writeto(path)
+    np.testing.assert_allclose(read_star_positions(path, image), PIXELS, atol=1e-6)
+
+
+def test_rows_without_a_place_on_the_sky_are_left_out(image, tmp_path):
+    sky = np.vstack([image.celestial(PIXELS), [[-999.0, -999.0], [np.nan, 10.0], [10.0, 90.5]]])
+    Table({"ra": sky[:, 0], "dec": sky[:, 1]}).write(tmp_path / "stars.csv")
+    np.testing.assert_allclose(read_star_positions(tmp_path / "stars.csv", image), PIXELS, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("table", "text"),
+    [
+        ({"ra": ["10:20:30", "10:20:31"], "dec": [1.0, 2.0]}, r"stars\.ecsv: column ra = .*: expected real numbers"),
+        ({"x": ["a", "b"], "y": [1.0, 2.0]}, r"stars\.ecsv: column x = .*: expected real numbers"),
+        ({"ra": [1.0, 2.0] * u.s, "dec": [1.0, 2.0] * u.deg}, r"stars\.ecsv: column ra = .*: expected .*rad"),
+    ],
+)
+def test_columns_that_are_no_positions(image, tmp_path, table, text):
+    Table(table).write(tmp_path / "stars.ecsv")
+    with pytest.raises(PachonError, match=text):
+        read_star_positions(tmp_path / "stars.ecsv", image)
