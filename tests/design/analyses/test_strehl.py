@@ -24,6 +24,24 @@ def test_the_image_may_be_left_out(paraboloid):
     assert result.summary()["strehl_of_psf"] == [[None, None]]
 
 
+def test_the_image_has_the_vignetting_of_the_wavefront(paraboloid):
+    factors = ((0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.2, 0.3, 0.4, 0.0))
+    telescope = paraboloid(2.0, 20.0, shift=6e-4).with_design(
+        field_type="angle", fields=((0.0, 0.0), (0.0, 1e-4)), vignetting=factors
+    )
+    result = pachon.strehl(telescope, wavelengths=5e-7)
+    assert result.psf == pytest.approx(result.wavefront, abs=5e-3)
+    unvignetted = pachon.strehl(telescope, telescope.design_data.fields, 5e-7)
+    assert result.psf[1, 0] > unvignetted.psf[1, 0] + 0.1
+
+
+def test_only_the_fields_of_large_aberrations_have_no_image(paraboloid):
+    result = pachon.strehl(paraboloid(2.0, 1.5), [(0.0, 0.0), (0.0, 1e-2)], 5e-7)
+    assert result.psf[0, 0] == pytest.approx(1.0, abs=1e-6)
+    assert np.isnan(result.psf[1, 0])
+    assert result.rms_wavefront[1, 0] > 1e-5
+
+
 def test_parallel_light_is_refused_in_one_line(afocal):
     telescope, place = afocal(fold=False), [(0.0, 0.0)]
     for analyse in (pachon.field_curvature, pachon.design.spot_matrix, pachon.strehl):
