@@ -16,6 +16,8 @@ from ..raytrace.trace import trace
 
 #: Step of the slopes for the scale on the axis.
 _SLOPE = 1e-4
+#: Height of a paraxial chief ray at the image, for a slope of 1 and over the diameter of the pupil, that is rounding.
+_ROUNDING = 1e-12
 #: Steps in which real image heights are followed from the axis outwards.
 _STEPS = 10
 
@@ -40,7 +42,13 @@ def design_fields(telescope: Telescope, projection: Projection = "zemax") -> np.
     if data.field_type == "object_height":
         return field_angles(points / (telescope.stop_z - telescope.object_distance), projection)
     if data.field_type == "paraxial_image_height":
-        return field_angles(points / stop_image(telescope).image_scale, projection)
+        scale = stop_image(telescope).image_scale
+        if abs(scale) < _ROUNDING * telescope.pupil_diameter:
+            raise DomainError(
+                f"{telescope.name}: fields as paraxial_image_height: expected a stop that is not at the image, where "
+                "chief rays of all fields land on the axis"
+            )
+        return field_angles(points / scale, projection)
     return field_angles(_real_slopes(telescope), projection)
 
 

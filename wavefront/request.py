@@ -227,6 +227,13 @@ class Request:
         return relative_weights(self.stated_weights, len(self.fields), "field_weights")
 
     @property
+    def pupil_areas(self) -> np.ndarray:
+        """Area of the pupil of each field over that of one without vignetting factors, shape [n_field]."""
+        if self.vignetting is None:
+            return np.ones(len(self.fields))
+        return np.asarray(np.abs((1.0 - self.vignetting[:, 2:4]).prod(axis=1)))
+
+    @property
     def middle(self) -> float:
         """Wavelength to which reference points belong [m]: the primary one, or that in the middle of the list."""
         return float(self.wavelengths[self.middle_index])

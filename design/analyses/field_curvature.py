@@ -48,7 +48,7 @@ class FieldCurvature(Analysis):
         rays close to the chief ray, in and across the plane of field point and axis.
     distortion : ndarray, shape [n_field, n_wave]
         Landing point of the chief ray from the axis against the scale on the axis times the tangent of the field angle,
-        less 1 [percent]; NaN on the axis. Each wavelength has a scale of its own.
+        less 1 [percent]; 0 on the axis. Each wavelength has a scale of its own.
     focal_length : ndarray, shape [n_wave]
         That scale [m]: length on the detector over slope.
     """
@@ -137,7 +137,7 @@ def field_curvature(
     axes = tangential_axes(request)
     steps = _CLOSE * 0.5 * telescope.pupil_diameter * np.concatenate([axes, -axes], axis=1)
     slopes = _NEAR_AXIS * np.array([0.0, 1.0, -1.0, 2.0, -2.0])
-    axis = replace(request, fields=np.stack([0.0 * slopes, slopes], axis=-1), projection="gnomonic")
+    axis = replace(request.at_fields(np.stack([0.0 * slopes, slopes], axis=-1)), projection="gnomonic")
     foci, distortion, scales = [], [], []
     for wavelength in map(float, request.wavelengths):
         bundles = request.bundles(wavelength, steps)

@@ -188,7 +188,7 @@ def _projected(request: Request, coatings: Coatings | None) -> tuple[float, floa
     area = np.pi * (0.5 * telescope.pupil_diameter * index) ** 2 * (1.0 - telescope.pupil_obscuration**2)
     fraction = float(sample.weights[lit].sum())
     mean = float(np.average(ratio[finite], weights=sample.weights[lit][finite])) if finite.any() else 0.0
-    return area * fraction * mean, fraction
+    return area * fraction * mean, fraction * float(request.pupil_areas[0])
 
 
 def _cones_through_the_pupil(request: Request, points: np.ndarray) -> np.ndarray:

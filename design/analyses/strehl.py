@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
+from ...core.errors import DomainError
 from ...core.plotting import BLUE
 from ...core.threads import one_blas_thread
 from ...models.camera.focal_plane import FocalPlane
@@ -39,7 +40,8 @@ class StrehlRatios(Analysis):
         largest: the brightest point of the image. Light is even over the entrance pupil. NaN where the wavefront is too
         steep for so many points.
     psf : ndarray, shape [n_field, n_wave]
-        Peak of the diffraction image over that of the same lit pupil with a perfect wavefront; NaN where not asked for.
+        Peak of the diffraction image over that of the same lit pupil with a perfect wavefront; NaN where not asked
+        for, or where aberrations are too large for an image.
     """
 
     rms_wavefront: np.ndarray
@@ -121,24 +123,34 @@ def strehl(
     Raises
     ------
     DomainError
-        If no light of a field passes, or the aberrations are too large for a diffraction image.
+        If no light of a field passes.
     """
     request = Request.of(
         telescope, fields, wavelengths, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
     ).on(focal_plane)
-    telescope, threads, projection = request.telescope, request.threads, request.projection
     shape = (len(request.fields), len(request.wavelengths))
     rms, ratio, peak = (np.full(shape, np.nan) for _ in range(3))
     for w, wavelength in enumerate(map(float, request.wavelengths)):
         bundles = request.bundles(wavelength)
-        opd = bundles.opd(telescope.sphere_radius)
+        opd = bundles.opd(request.telescope.sphere_radius)
         for i, lit in enumerate(bundles.lit):
             rms[i, w], ratio[i, w] = _rms_and_strehl(opd[i], lit, request, wavelength)
         if from_psf:
-            star = Request.of(telescope, request.fields, wavelength, projection=projection, threads=threads)
-            star = star.on(request.focal_plane)
-            peak[:, w] = fft_psf(star, pixels=64).strehl
+            peak[:, w] = _image_peaks(replace(request, wavelengths=np.array([wavelength]), weights=np.ones(1)))
     return StrehlRatios(request, rms, ratio, peak)
+
+
+def _image_peaks(request: Request) -> np.ndarray:
+    """Return the Strehl ratios of diffraction images, shape [n_field]; NaN where aberrations are too large for one."""
+    try:
+        return fft_psf(request, pixels=64).strehl
+    except DomainError as error:
+        if error.key != "n_pupil":
+            raise
+    count = len(request.fields)
+    if count == 1:
+        return np.full(1, np.nan)
+    return np.concatenate([_image_peaks(request.at_fields(slice(i, i + 1))) for i in range(count)])
 
 
 def _rms_and_strehl(opd: np.ndarray, lit: np.ndarray, request: Request, wavelength: float) -> tuple[float, float]:

@@ -184,7 +184,8 @@ def _passed(
         transmission = transmission * efficiency
         with np.errstate(invalid="ignore"):
             steps[name] = (weight * efficiency).sum(axis=1) / fraction
-    return (weight * transmission).sum(axis=1), fraction, steps
+    areas = request.pupil_areas
+    return areas * (weight * transmission).sum(axis=1), areas * fraction, steps
 
 
 def efficiencies(request: Request, coatings: Coatings, wavelength: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -53,6 +53,8 @@ _AT_ONCE = 4096
 _PEAK = 3.0
 #: Largest number of points of that search along an axis.
 _MOST_PLACES = 192
+#: Highest samples that the search begins at in larger images.
+_CANDIDATES = 8
 #: Finer points along an axis about the highest of them.
 _FINE = 33
 
@@ -172,6 +174,8 @@ def huygens_psf(
 
 
 _Sum = Callable[[np.ndarray, np.ndarray], np.ndarray]
+#: Weight, wavelets and sum of a wavelength.
+_Waves = tuple[float, Wavelets, _Sum]
 
 
 def lattice_sum(lattice: WaveletLattice, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -240,19 +244,21 @@ class _Plan:
         images, lit, strehl = [], [], []
         for i, center in enumerate(self.spots.reference_point):
             field_request = self.request.at_fields(slice(i, i + 1))
-            by_wavelength: list[tuple[float, Wavelets, _Sum]] = []
-            total = np.zeros((self.pixels, self.pixels))
+            by_wavelength: list[_Waves] = []
+            total, samples = np.zeros((self.pixels, self.pixels)), np.zeros((len(finer), len(finer)))
             for wavelength, weight in zip(self.request.wavelengths, self.request.weights, strict=True):
                 wavelets, irradiance = waves(field_request, float(wavelength), center)
                 by_wavelength.append((float(weight), wavelets, irradiance))
-                total += weight * self._on_pixels(irradiance(finer, finer))
+                sampled = irradiance(finer, finer)
+                total += weight * self._on_pixels(sampled)
+                samples += weight * sampled
                 if progress is not None:
                     progress(1)
             lit_fraction = sum(weight * wavelets.lit_fraction for weight, wavelets, _ in by_wavelength)
             perfect = sum(weight * wavelets.perfect_peak for weight, wavelets, _ in by_wavelength)
             images.append(total * self.pixel**2 / lit_fraction)
             lit.append(lit_fraction)
-            strehl.append(self._peak(by_wavelength, total) / perfect)
+            strehl.append(self._peak(by_wavelength, finer, samples) / perfect)
         return DiffractionPsf(
             request=self.request,
             method=method,
@@ -283,18 +289,25 @@ class _Plan:
         across = len(irradiance) // self.pixels
         return irradiance.reshape(self.pixels, across, self.pixels, across).mean(axis=(1, 3))
 
-    def _peak(self, by_wavelength: Sequence[tuple[float, Wavelets, _Sum]], image: np.ndarray) -> float:
-        """Return the highest irradiance of the image [1/m^2]."""
+    def _peak(
+        self, by_wavelength: Sequence[tuple[float, Wavelets, _Sum]], axis: np.ndarray, image: np.ndarray
+    ) -> float:
+        """Return the highest irradiance [1/m^2] from that at samples along an axis [m]."""
 
         def irradiance(x: np.ndarray, y: np.ndarray) -> np.ndarray:
             return np.asarray(sum(weight * at(x, y) for weight, _, at in by_wavelength))
 
-        axis, step = pixel_axis(self.pixel, self.pixels), self.pixel
-        if step > self.wave_over_range / _PEAK:
-            # The pixels are too coarse for the peak.
-            half = 0.5 * self.pixel * self.pixels
-            axis = np.linspace(-half, half, min(int(2.0 * half / self.wave_over_range * _PEAK) + 2, _MOST_PLACES))
-            step, image = float(axis[1] - axis[0]), irradiance(axis, axis)
-        row, column = np.unravel_index(int(np.argmax(image)), image.shape)
+        half = 0.5 * self.pixel * self.pixels
+        places = int(2.0 * half / self.wave_over_range * _PEAK) + 2
+        if len(axis) < places <= _MOST_PLACES:
+            # The samples are too coarse for the peak.
+            axis = np.linspace(-half, half, places)
+            image = irradiance(axis, axis)
+        step = float(axis[1] - axis[0])
         fine = step * np.linspace(-1.0, 1.0, _FINE)
-        return float(irradiance(axis[column] + fine, axis[row] + fine).max())
+        # In larger images samples may miss a narrow peak, as that of spherical aberration in the middle.
+        large = places > _MOST_PLACES
+        highest = np.argsort(image, axis=None)[: -1 - (_CANDIDATES if large else 1) : -1]
+        rows, columns = np.unravel_index(highest, image.shape)
+        beginnings = [*zip(axis[columns], axis[rows], strict=True), *([(0.0, 0.0)] if large else [])]
+        return max(float(irradiance(x + fine, y + fine).max()) for x, y in beginnings)

@@ -143,3 +143,9 @@ def test_zernikes_of_aimed_and_vignetted_fields_are_those_of_their_rays(lens):
     r2 = (request.unit_pupil**2).sum(axis=1)
     z4 = np.sqrt(3.0) * (2.0 * r2 - 1.0)
     assert found.coefficients[:, 3] == pytest.approx((request.pupil.weights * z4 * value).sum(axis=1), abs=1e-13)
+
+
+def test_image_heights_need_a_stop_that_is_not_at_the_image(lens):
+    at_image = lens.with_design(stop=lens.surface_names[-1], field_type="paraxial_image_height")
+    with pytest.raises(DomainError, match="paraxial_image_height: expected a stop that is not at the image"):
+        pachon.Request.of(at_image)

@@ -78,7 +78,7 @@ def clear_region(blocked: Aperture) -> Aperture:
 
 
 def obscuration_items(aperture: Aperture) -> dict[str, Any]:
-    """Return the section of the obscuration that leaves an aperture clear."""
+    """Return the section of the obscuration that leaves an aperture clear; PrescriptionError where batoid has none."""
     return _region_items(clear_region(aperture))
 
 
@@ -97,5 +97,8 @@ def _region_items(region: Aperture) -> dict[str, Any]:
         xs, ys = zip(*region.corners, strict=True)
         return {"type": "ObscPolygon", "xs": list(xs), "ys": list(ys)}
     section = written(OBSCURATIONS, region)
-    assert section is not None
+    if section is None:
+        raise PrescriptionError(
+            f"aperture {type(region).__name__}: expected one that batoid has: disc, ring, rectangle, polygon, vane"
+        )
     return {"type": section[0]} | section[1]

@@ -57,3 +57,15 @@ def test_a_tilted_field_is_like_one_on_the_axis_of_symmetry(singlet):
     other = pachon.field_curvature(telescope, [(0.06, -0.08)], projection="postel")
     assert other.tangential == pytest.approx(one.tangential, abs=1e-9)
     assert other.sagittal == pytest.approx(one.sagittal, abs=1e-9)
+
+
+def test_a_request_with_vignetting_factors(paraboloid):
+    factors = ((0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.3, 0.4, 0.0))
+    fields = ((0.0, 0.0), (0.0, 5e-3))
+    telescope = paraboloid(2.0, 8.0).with_design(field_type="angle", fields=fields, vignetting=factors)
+    stated = pachon.field_curvature(pachon.Request.of(telescope))
+    given = pachon.field_curvature(telescope, fields)
+    # Close rays of a smaller pupil are closer: the focus differs by a millionth of the aberration.
+    assert stated.tangential == pytest.approx(given.tangential, rel=1e-4, abs=1e-9)
+    assert stated.focal_length == pytest.approx(given.focal_length, rel=1e-12)
+    assert stated.distortion == pytest.approx(given.distortion, abs=1e-9)

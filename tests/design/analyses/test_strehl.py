@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -22,6 +24,37 @@ def test_the_image_may_be_left_out(paraboloid):
     assert np.isnan(result.psf).all()
     assert result.wavefront == pytest.approx(1.0, abs=1e-9)
     assert result.summary()["strehl_of_psf"] == [[None, None]]
+
+
+def test_the_image_has_the_vignetting_of_the_wavefront(paraboloid):
+    factors = ((0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.2, 0.3, 0.4, 0.0))
+    telescope = paraboloid(2.0, 20.0, shift=6e-4).with_design(
+        field_type="angle", fields=((0.0, 0.0), (0.0, 1e-4)), vignetting=factors
+    )
+    result = pachon.strehl(telescope, wavelengths=5e-7)
+    assert result.psf == pytest.approx(result.wavefront, abs=5e-3)
+    unvignetted = pachon.strehl(telescope, telescope.design_data.fields, 5e-7)
+    assert result.psf[1, 0] > unvignetted.psf[1, 0] + 0.1
+
+
+def test_only_the_fields_of_large_aberrations_have_no_image(paraboloid):
+    result = pachon.strehl(paraboloid(2.0, 1.5), [(0.0, 0.0), (0.0, 1e-2)], 5e-7)
+    assert result.psf[0, 0] == pytest.approx(1.0, abs=1e-6)
+    assert np.isnan(result.psf[1, 0])
+    assert result.rms_wavefront[1, 0] > 1e-5
+
+
+def test_the_narrow_peak_of_a_large_image(paraboloid):
+    # The middle of a blur of 1000 wavelengths times the focal ratio across is a maximum, one Airy disc wide.
+    f_number, wavelength = 20.0, 5e-7
+    telescope = paraboloid(2.0, f_number, shift=8 * f_number**2 * 20.4 * wavelength)
+    radius = 0.5 * telescope.pupil_diameter * np.sqrt((np.arange(4000) + 0.5) / 4000)
+    # Against a plane: a sphere differs by the square of the blur over its radius.
+    flat = replace(telescope, reference_sphere_radius=1e5)
+    opd = pachon.wavefront_opd(flat, (0.0, 0.0), wavelength, (radius, 0.0 * radius)).value
+    middle = abs(np.exp(2j * np.pi * opd / wavelength).mean()) ** 2
+    # A lattice of 440 points makes it 3 % lower.
+    assert pachon.strehl(telescope, [(0.0, 0.0)], wavelength).psf[0, 0] > 0.95 * middle
 
 
 def test_parallel_light_is_refused_in_one_line(afocal):

@@ -80,6 +80,16 @@ def test_vignetting_is_in_it(paraboloid):
     assert result.surfaces == ()
 
 
+def test_vignetting_factors_take_their_part_of_the_entrance_pupil(paraboloid):
+    factors, fields = ((0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.1, 0.2, 0.5, 0.3)), ((0.0, 0.0), (0.0, 5e-3))
+    telescope = paraboloid(2.0, 10.0).with_design(field_type="angle", fields=fields, vignetting=factors)
+    result = pachon.design.throughput(telescope, wavelengths=5e-7)
+    assert result.value[:, 0] == pytest.approx([1.0, 0.8 * 0.5], rel=1e-12)
+    assert result.lit_fraction == pytest.approx(result.value)
+    light = pachon.design.relative_illumination(pachon.Request.of(telescope, one_wavelength=True))
+    assert light.lit_fraction == pytest.approx([1.0, 0.8 * 0.5], rel=1e-12)
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [

@@ -10,6 +10,7 @@ import yaml
 
 import pachon
 from pachon.core.errors import ConfigError, PrescriptionError, PrescriptionWarning
+from pachon.models.aperture import Ellipse
 from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.media.tabulated import TabulatedIndex
 from pachon.models.shapes.freeform import Biconic
@@ -178,6 +179,10 @@ def test_lenient_does_not_take_what_it_cannot_trace(loaded):
     ("change", "message"),
     [
         (lambda t: t.with_shape("M1", Biconic(9.0, 8.0)), "lsst_v3.3_r: surface M1: shape Biconic: expected"),
+        (
+            lambda t: replace(t, surfaces=(replace(t.surfaces[0], aperture=Ellipse(4.0, 3.0)), *t.surfaces[1:])),
+            "lsst_v3.3_r: surface M1: aperture Ellipse: expected one that batoid has",
+        ),
         (lambda t: replace(t, object_distance=100.0), "object_distance = 100.0"),
         (lambda t: replace(t, surfaces=t.surfaces[:-1], groups={}, group_frames={}), "needs a detector"),
         (lambda t: t.with_obstructions(pachon.models.Obstruction("top", np.eye(3)[None])), "obstruction top"),
