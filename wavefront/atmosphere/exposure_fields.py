@@ -101,7 +101,9 @@ class ExposureFields:
 
     common: np.ndarray  #: moments that all stars share, p, q, s [rad^2], [3]
     moments: SplineFields  #: those that change over the field
-    by_optics: np.ndarray  #: share of the variance of p, q, s that aberrations of the optics add, [3]
+    #: Share of the variance of p, q, s that aberrations of the optics add, and power of the lit fraction that it goes
+    #: as, [2, 3].
+    by_optics: np.ndarray
     common_wavefront: np.ndarray  #: Zernikes of :data:`NOLL` of the layers on the ground [m]
     wavefronts: tuple[SplineFields, ...]  #: of the others
 
@@ -109,9 +111,13 @@ class ExposureFields:
         """Return p = Mxx - Myy, q = 2 Mxy, s = Mxx + Myy beyond their mean [rad^2] at field slopes [n, 2], [n, 3]."""
         return self.common + self.moments.at(slopes)
 
-    def optics_factor(self, aberration: np.ndarray) -> np.ndarray:
-        """Return factors of the moments where the square of aberrations is so many times their mean [n], [n, 3]."""
-        return np.sqrt(1.0 + self.by_optics * (aberration[:, None] - 1.0))
+    def optics_factor(self, relative: np.ndarray) -> np.ndarray:
+        """Return factors of the moments, [n, 3], of stars with other optics than the mean over the field.
+
+        Relative to it are the square of aberrations and the lit fraction, [n, 2].
+        """
+        share, power = self.by_optics
+        return np.sqrt((1.0 + share * (relative[:, :1] - 1.0)) * relative[:, 1:] ** power)
 
     def wavefronts_at(self, slopes: np.ndarray) -> np.ndarray:
         """Return Zernikes of :data:`NOLL` of the mean path [m] at field slopes [n, 2] [rad], [n, n_noll]."""
@@ -143,7 +149,8 @@ def moment_spectrum(
     """Return lower Cholesky factors of the spectra of the moments on a grid, and that of what all stars share.
 
     Factors of row i are i + 1 arrays [size, size // 2 + 1] [rad^2], with the gain of splines; the other is [3, 3]. The
-    last result is the share of the variances that aberrations of the optics add, [3].
+    last result are the share of the variances that aberrations of the optics add, and the power of the lit fraction
+    that they go as, [2, 3].
     """
     ends = 0.5 * math.sqrt(2.0) * grid.side
     highest = max(air.altitudes, default=0.0)
@@ -154,8 +161,8 @@ def moment_spectrum(
     lags = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     # The first ring is the lag zero.
     lags = np.concatenate([lags[0, :1], lags[1:].reshape(-1, 2)])
-    of_orders = moment_covariance(air, lags, response.aberration)
-    covariances, by_optics = of_orders.total(response), of_orders.parts(response)[2, 0]
+    of_orders = moment_covariance(air, lags, response.aberration, response.lit)
+    covariances = of_orders.total(response)
     polar = np.concatenate([np.repeat(covariances[:1], _SPOKES, axis=0), covariances[1:]]).reshape(_RINGS, _SPOKES, 6)
     # What stars half a period apart share, all stars do.
     shared = _positive(as_matrices(polar[np.searchsorted(radius, 0.5 * grid.side)].mean(axis=0)))
@@ -175,8 +182,11 @@ def moment_spectrum(
     )
     # Opposite lags have equal covariances: transforms of opposite rows are conjugates, and the spectra are real.
     spectra = scipy.fft.hfft(scipy.fft.rfft(covariance), grid.size, axis=1, overwrite_x=True)
-    share = by_optics / np.maximum(covariances[0, :3], 1e-12 * scale)
-    return _factors(spectra, scale), np.linalg.cholesky(shared + 1e-12 * scale * np.eye(3)), share
+    all_lit = moment_covariance(air, lags[:1], response.aberration).total(response)[0, :3]
+    variance, light = np.maximum(covariances[0, :3], 1e-12 * scale), math.log(response.lit[0])
+    power = np.log(variance / np.maximum(all_lit, 1e-12 * scale)) / light if light < 0.0 else np.zeros(3)
+    by_optics = np.stack([of_orders.parts(response)[2, 0] / variance, power])
+    return _factors(spectra, scale), np.linalg.cholesky(shared + 1e-12 * scale * np.eye(3)), by_optics
 
 
 def _factors(spectra: np.ndarray, scale: float) -> tuple[tuple[np.ndarray, ...], ...]:

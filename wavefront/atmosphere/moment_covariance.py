@@ -128,11 +128,11 @@ class MomentResponse(NamedTuple):
     #: Covariance of the slopes of the optics' aberrations at two points of the pupil, mean of both components' sum over
     #: all directions, at equal steps of distance from none to the diameter [rad^2].
     aberration: tuple[float, ...] = (0.0,)
+    #: Part of the pairs of points at these distances that are both lit, of those in the annular pupil.
+    lit: tuple[float, ...] = (1.0,)
 
     @classmethod
-    def of(
-        cls, wavenumber: np.ndarray, transfer: np.ndarray, weight_rms: float, aberration: tuple[float, ...] = (0.0,)
-    ) -> Self:
+    def of(cls, wavenumber: np.ndarray, transfer: np.ndarray, weight_rms: float) -> Self:
         """Return that of a transfer function at equally spaced wavenumbers [rad/rad] and a weight's rms width [rad]."""
         power = transfer * np.exp(-0.5 * (weight_rms * wavenumber) ** 2)
         j0, j2, j4, j6, j8 = (float(np.sum(power * wavenumber ** (n + 1))) for n in (0, 2, 4, 6, 8))
@@ -148,7 +148,6 @@ class MomentResponse(NamedTuple):
             -of_second / 8.0,
             (j6 / j4, j8 / j4),
             (size(j4, j6) / of_second, size(j6, j8) / of_second),
-            aberration,
         )
 
     @property
@@ -193,13 +192,17 @@ def as_matrices(pairs: np.ndarray) -> np.ndarray:
 
 
 def moment_covariance(
-    air: ExposedAir, lags: np.ndarray, aberration: tuple[float, ...] = (0.0,), threads: int | None = None
+    air: ExposedAir,
+    lags: np.ndarray,
+    aberration: tuple[float, ...] = (0.0,),
+    lit: tuple[float, ...] = (1.0,),
+    threads: int | None = None,
 ) -> MomentCovariance:
     """Return the covariances of the moments of two stars whose field slopes are lags [n, 2] [rad] apart.
 
-    The aberration is that of :class:`MomentResponse`.
+    Aberration and lit pairs are those of :class:`MomentResponse`.
     """
-    lag, delays = np.asarray(lags, dtype=np.float64).reshape(-1, 2), _Delays.of(air, aberration)
+    lag, delays = np.asarray(lags, dtype=np.float64).reshape(-1, 2), _Delays.of(air, aberration, lit)
     # All stars share the layers on the ground.
     ground = np.zeros(delays.baseline.shape, dtype=np.float32)
     _, common = _averages(air.on_ground(), np.zeros((1, 2)), delays, np.zeros((0, TERMS)), ground, threads)
@@ -260,7 +263,7 @@ class _Delays:
     baseline: np.ndarray
 
     @classmethod
-    def of(cls, air: ExposedAir, aberration: tuple[float, ...]) -> Self:
+    def of(cls, air: ExposedAir, aberration: tuple[float, ...], lit: tuple[float, ...]) -> Self:
         """Return those of an exposure: dense near zero, where the slopes of all layers vary most."""
         fastest = max((math.hypot(x, y) for x, y in air.velocities), default=0.0)
         near = min(_NEAR / max(fastest, 1e-9), 0.5 * air.exposure)
@@ -279,10 +282,13 @@ class _Delays:
         sets = [lattices[int(n)][k] for k, n in enumerate(near_by)]
         start = np.concatenate([[0], np.cumsum([len(points) for points in sets])])
         baseline = np.concatenate(sets)
-        distance = np.hypot(baseline[:, 0], baseline[:, 1])
-        covariance = np.interp(distance, np.linspace(0.0, air.diameter, len(aberration)), aberration)
-        with_aberration = (baseline[:, 2] * covariance / _MICRO**2).astype(np.float32)
-        baseline = np.concatenate([baseline, with_aberration[:, None]], axis=1)
+        distance = np.hypot(baseline[:, 0], baseline[:, 1]) / air.diameter
+        both_lit, covariance = (np.interp(distance, np.linspace(0.0, 1.0, len(t)), t) for t in (lit, aberration))
+        light = baseline[:, 2] * both_lit
+        total = np.add.reduceat(light.sum(axis=1), start[:-1])
+        light /= np.repeat(total, np.diff(start))[:, None]
+        baseline = np.stack([baseline[:, 0], baseline[:, 1], light, light * covariance / _MICRO**2], axis=1)
+        baseline = baseline.astype(np.float32)
         return cls(time, width, weight / weight.sum(), start, baseline)
 
 

@@ -33,7 +33,6 @@ from ..atmosphere.exposure_fields import NOLL, ExposureFields, draw_exposure
 from ..atmosphere.moment_covariance import LEAST_EXPOSURE, ExposedAir, MomentResponse
 from ..atmosphere.turbulence import diffraction_otf
 from ..pupil_optics import PupilOptics, trace_pupils
-from .aberration_slopes import AberrationSlopes
 from .clear_pupil import SpokePupil
 from .engine import ExposedStars, PsfInputs, Stars
 from .far_from_focus import blur_radii, check_stamp
@@ -42,6 +41,7 @@ from .image_plane import square_transfer
 from .lattice_pupil import RINGS_POINTS
 from .long_exposure import LongExposureEngine, LongExposureRenderer
 from .mean_rays import FAR_ANGLE
+from .pupil_means import PupilMeans
 from .sample_packets import samples
 from .spectral_rule import spectral_rule
 from .statistical_kernels import blur_spectra
@@ -129,7 +129,7 @@ class StatisticalRenderer(LongExposureRenderer):
         self._light = inputs.wavelengths
         self._rule = None if inputs.has_spectra else spectral_rule(inputs, self.depths)
         super().__init__(inputs if self._rule is None else self._rule.inputs(inputs), options)
-        self._aberration_slopes = AberrationSlopes.of(inputs)
+        self._pupil_means = PupilMeans.of(inputs)
         with_air = _WithAir.of(self._base, self._exposed_air, self.drawn)
         self._inputs = replace(self._inputs, aberration=with_air)
 
@@ -152,15 +152,16 @@ class StatisticalRenderer(LongExposureRenderer):
         pixel = square_transfer(on_detector, 0.0 * k, self._plane.pixel_size)
         spread = np.exp(-0.5 * (self._plane.diffusion**2 + self._plane.jitter**2) * on_detector**2)
         mean = (self._turbulence(baseline, self._light) * diffraction).mean(axis=0)
-        covariance = self._aberration_slopes.covariance
-        spread = spread * np.exp(-0.25 * covariance[0] * k**2)
-        return MomentResponse.of(k, mean * pixel * spread, weight, covariance)
+        aberration = self._pupil_means.aberration
+        spread = spread * np.exp(-0.25 * aberration[0] * k**2)
+        response = MomentResponse.of(k, mean * pixel * spread, weight)
+        return response._replace(aberration=aberration, lit=self._pupil_means.lit)
 
     def kernels(self, optics: PupilOptics) -> np.ndarray:
         """Return the Gaussian kernels of stars on the sky, xx, yy, xy [rad^2], [n_star, 3]."""
         direction = self._direction(optics.fields)
         slopes = direction[:, :2] / -direction[:, 2:]
-        by_optics = self.drawn.optics_factor(self._aberration_slopes.relative(slopes))
+        by_optics = self.drawn.optics_factor(self._pupil_means.relative(slopes))
         p, q, s = (self.drawn.moments_at(slopes) * by_optics).T
         wavefront = self.drawn.wavefronts_at(slopes)
         of_mean = np.einsum("ni,kij,nj->nk", wavefront, self._mean_moments, wavefront)

@@ -69,6 +69,19 @@ def test_half_variograms_between_samples():
     assert ratio[1:] == pytest.approx(np.ones((2, 3)), abs=0.03)
 
 
+def test_stars_with_less_light_have_larger_moments():
+    """Where far pairs of points are dark variances go as a negative power of the light; where all are, as none."""
+    grid = FieldGrid.of(AIR, FIELD_RADIUS)
+    alike, far = ((0.8, 0.8), (0.8, 0.4, 0.1))
+    (_, _, by_alike), (_, _, by_far) = (moment_spectrum(AIR, RESPONSE._replace(lit=lit), grid) for lit in (alike, far))
+    assert by_alike[1] == pytest.approx(np.zeros(3), abs=1e-3)
+    assert np.all((by_far[1] < -0.5) & (by_far[1] > -3.0))
+    fields = ExposureFields(np.zeros(3), None, by_far, np.zeros(12), ())
+    factor = fields.optics_factor(np.array([[1.0, 1.0], [1.0, 0.9]]))
+    assert factor[0] == pytest.approx(np.ones(3))
+    assert factor[1] == pytest.approx(0.9 ** (0.5 * by_far[1]))
+
+
 def test_modes_are_those_of_white_noise():
     """600 grids of 8 x 8: unit variance, and one power at all frequencies, also those whose opposite is themselves.
 
@@ -108,7 +121,7 @@ def test_mean_wavefronts_have_their_covariances(altitudes, side):
     for seed in range(3):
         ground, fields = exposure_fields._draw_wavefronts(air, grid, seed, 0)
         assert not ground.any()
-        drawn = ExposureFields(np.zeros(3), fields[0], np.zeros(3), ground, fields)
+        drawn = ExposureFields(np.zeros(3), fields[0], np.zeros((2, 3)), ground, fields)
         here, there = drawn.wavefronts_at(stars), drawn.wavefronts_at(stars + lag)
         covariance += np.array([here.T @ here, here.T @ there]) / (3 * len(stars) * scale)
     # 750 m of a layer, 8 m across and 50 m along the wind for each independent patch: some 4200, two standard errors,

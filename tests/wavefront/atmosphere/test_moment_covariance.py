@@ -11,7 +11,7 @@ from pachon.core.units import ARCMIN, ARCSEC
 from pachon.wavefront.atmosphere.layer_screens import SLOPE_LAG
 from pachon.wavefront.atmosphere.moment_covariance import ExposedAir, MomentResponse, as_matrices, moment_covariance
 from pachon.wavefront.atmosphere.slope_covariance import slope_covariance
-from pachon.wavefront.atmosphere.turbulence import path_spectrum, slope_variance
+from pachon.wavefront.atmosphere.turbulence import diffraction_otf, path_spectrum, slope_variance
 
 R0, L0, CUTOFF = 0.16, 25.0, 8.75
 #: A small pupil under two layers: few points sample it densely.
@@ -166,6 +166,20 @@ def test_higher_orders_against_sums_over_a_small_pupil(lag):
     # The mean slope, which takes a part of the second order, is left in these sums.
     assert got[1:] == pytest.approx(means[1:], rel=0.03)
     assert np.all(got[0] < means[0])
+
+
+def test_lit_pairs_make_a_smaller_pupil():
+    """Baselines of a pupil three quarters as wide, which dark rims leave of the whole one."""
+    small = AIR._replace(diameter=1.2, obscuration=0.4)
+    distance = np.linspace(0.0, AIR.diameter, 161)
+    pairs = diffraction_otf(distance, 1.2, 0.4) / np.maximum(diffraction_otf(distance, 1.6, 0.3), 1e-9)
+    lags = np.array([[0.0, 0.0], [30.0, -20.0]]) * ARCSEC
+    expected = moment_covariance(small, lags).second
+    got = moment_covariance(AIR, lags, lit=tuple(0.5 * pairs)).second
+    whole = moment_covariance(AIR, lags).second
+    # The lattice of baselines is finer for the smaller pupil.
+    assert got == pytest.approx(expected, abs=0.02 * expected[0, 2])
+    assert whole[0, 2] < 0.9 * got[0, 2]
 
 
 def test_covariances_are_even_and_of_one_process():

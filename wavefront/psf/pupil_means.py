@@ -1,4 +1,4 @@
-"""Slopes that the aberrations of the optics have across the pupil, on the mean over the field of view."""
+"""Light in the pupil, and slopes of the aberrations across it, on the mean over the field of view."""
 
 from __future__ import annotations
 
@@ -17,15 +17,19 @@ _PUPIL_RINGS = 6
 _PUPIL_ANGLES = 12
 # Steps of the distance of two points of the pupil, up to its diameter.
 _STEPS = 12
+# Least lit fraction over its mean.
+_LEAST_LIT = 0.2
 
 
-class AberrationSlopes(NamedTuple):
-    """Mean squares of the slopes of the optics' aberrations, sums over both components about their mean."""
+class PupilMeans(NamedTuple):
+    """Light and slopes of aberrations, sums over both components about their mean, on the mean over field and pupil."""
 
-    #: Covariance at two points of the pupil, mean over the field, at steps of their distance from none to the diameter
-    #: [rad^2].
-    covariance: tuple[float, ...]
-    #: Mean square over its mean over the field, as a polynomial over the field: factors of 1, x, y, x^2, xy, y^2.
+    #: Covariance of slopes at two points of the pupil, at steps of their distance from none to the diameter [rad^2].
+    aberration: tuple[float, ...]
+    #: Part of the pairs of points at these distances that are both lit, of those in the annulus.
+    lit: tuple[float, ...]
+    #: Mean square of the slopes, and lit fraction, over their means over the field, as polynomials over the field:
+    #: factors of 1, x, y, x^2, xy, y^2, [6, 2].
     over_field: np.ndarray
 
     @classmethod
@@ -43,18 +47,19 @@ class AberrationSlopes(NamedTuple):
         except DomainError:
             fields = center
             slopes, lit = _slopes(inputs, fields, pupil)
-        products = np.einsum("fpi,fqi->pq", slopes, slopes)
         step = np.hypot(*(pupil[:, None] - pupil).T) * (_STEPS / telescope.pupil_diameter)
         # A pair counts at the step before its distance and at that after it, the more the nearer.
         near = np.maximum(1.0 - np.abs(step.ravel() - np.arange(_STEPS + 1)[:, None]), 0.0)
-        covariance = near @ products.ravel() / np.maximum(near @ (lit.T @ lit).ravel(), 1.0)
-        square = (slopes**2).sum(axis=(1, 2)) / np.maximum(lit.sum(axis=1), 1.0)
-        over_field = np.linalg.lstsq(_terms(fields), square / max(square.mean(), 1e-30), rcond=None)[0]
-        return cls(tuple(covariance.tolist()), over_field)
+        pairs = near @ (lit.T @ lit).ravel()
+        aberration = near @ np.einsum("fpi,fqi->pq", slopes, slopes).ravel() / np.maximum(pairs, 1.0)
+        both_lit = np.maximum(pairs / (len(fields) * np.maximum(near.sum(axis=1), 1e-9)), 1e-3)
+        means = np.stack([(slopes**2).sum(axis=(1, 2)) / np.maximum(lit.sum(axis=1), 1.0), lit.mean(axis=1)], axis=1)
+        over_field = np.linalg.lstsq(_terms(fields), means / np.maximum(means.mean(axis=0), 1e-30), rcond=None)[0]
+        return cls(tuple(aberration.tolist()), tuple(both_lit.tolist()), over_field)
 
     def relative(self, slopes: np.ndarray) -> np.ndarray:
-        """Return the mean square at field slopes [n, 2] over its mean over the field, [n]."""
-        return np.maximum(_terms(slopes) @ self.over_field, 0.0)
+        """Return mean square and lit fraction at field slopes [n, 2] over their means over the field, [n, 2]."""
+        return np.maximum(_terms(slopes) @ self.over_field, [0.0, _LEAST_LIT])
 
 
 def _terms(field: np.ndarray) -> np.ndarray:
