@@ -7,7 +7,7 @@ Wick's theorem gives the covariance of the moments of two stars a lag d apart:
 .. math:: \mathrm{cov}(M_{ij}, M'_{kl}) = \langle S_{ik} S_{jl} + S_{il} S_{jk} \rangle, \qquad
           S(u, \tau) = \sum_{layers} w \, S_{vK}(u - H d - V \tau).
 
-The mean is one over the baselines u of the pupil, with the weight of its autocorrelation, and over the delays
+The mean is one over the baselines u of the lit pupil, with the weight of its autocorrelation, and over the delays
 :math:`\tau` in the exposure T, with the weight :math:`1 - |\tau|/T`. S is squared after the sum over layers: its cross
 terms, of the ground with higher layers, are the largest that change over the field. What the mean slope takes away is
 included but for its change over the pupil, which is some per cent of a tenth.
