@@ -289,9 +289,7 @@ class _Plan:
         across = len(irradiance) // self.pixels
         return irradiance.reshape(self.pixels, across, self.pixels, across).mean(axis=(1, 3))
 
-    def _peak(
-        self, by_wavelength: Sequence[tuple[float, Wavelets, _Sum]], axis: np.ndarray, image: np.ndarray
-    ) -> float:
+    def _peak(self, by_wavelength: Sequence[_Waves], axis: np.ndarray, image: np.ndarray) -> float:
         """Return the highest irradiance [1/m^2] from that at samples along an axis [m]."""
 
         def irradiance(x: np.ndarray, y: np.ndarray) -> np.ndarray:

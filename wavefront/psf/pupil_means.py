@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple, Self
 
 import numpy as np
 
 from ...core.errors import DomainError
+from ..pupil_sampling import spiral_annulus
 from .engine import PsfInputs
 
-# Rings of equal area of the field and of the pupil, and points on each.
-_FIELD_RINGS = 2
-_FIELD_ANGLES = 5
-_PUPIL_RINGS = 6
-_PUPIL_ANGLES = 12
+# Points of the field and of the pupil.
+_FIELDS = 12
+_POINTS = 72
 # Steps of the distance of two points of the pupil, up to its diameter.
 _STEPS = 12
 # Least lit fraction over its mean.
@@ -39,13 +37,12 @@ class PupilMeans(NamedTuple):
         Where light does not reach all of the field of view, they are those of its centre.
         """
         telescope = inputs.telescope
-        pupil = 0.5 * telescope.pupil_diameter * _rings(_PUPIL_RINGS, _PUPIL_ANGLES, telescope.pupil_obscuration)
-        center = np.zeros((1, 2))
-        fields = np.concatenate([center, telescope.field_radius * _rings(_FIELD_RINGS, _FIELD_ANGLES, 0.0)])
+        pupil = spiral_annulus(0.5 * telescope.pupil_diameter, telescope.pupil_obscuration, _POINTS).points
+        fields = spiral_annulus(telescope.field_radius, 0.0, _FIELDS).points
         try:
             slopes, lit = _slopes(inputs, fields, pupil)
         except DomainError:
-            fields = center
+            fields = np.zeros((1, 2))
             slopes, lit = _slopes(inputs, fields, pupil)
         step = np.hypot(*(pupil[:, None] - pupil).T) * (_STEPS / telescope.pupil_diameter)
         # A pair counts at the step before its distance and at that after it, the more the nearer.
@@ -65,15 +62,6 @@ class PupilMeans(NamedTuple):
 def _terms(field: np.ndarray) -> np.ndarray:
     x, y = field.T
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-
-
-def _rings(rings: int, angles: int, inner: float) -> np.ndarray:
-    """Return points on rings of equal area of an annulus of outer radius 1, [n, 2]."""
-    area = (np.arange(rings) + 0.5) / rings
-    radius = np.sqrt(inner**2 + (1.0 - inner**2) * area)[:, None]
-    # Every other ring is turned by half a step.
-    angle = 2.0 * math.pi / angles * (np.arange(angles) + 0.5 * (np.arange(rings)[:, None] % 2))
-    return (radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
 
 
 def _slopes(inputs: PsfInputs, fields: np.ndarray, pupil: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
