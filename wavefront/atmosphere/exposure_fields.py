@@ -25,6 +25,7 @@ from ...models.zernike_polynomials import noll_to_nm
 from .field_kernels import add_wavefronts, factor_spectra, pairs, read_splines, spread_over_grid, zernikes
 from .mean_wavefront import mean_wavefront_covariance, radial_transform
 from .moment_covariance import PAIRS, ExposedAir, MomentResponse, as_matrices, moment_covariance
+from .polar_lags import PolarLags
 from .turbulence import path_spectrum
 
 #: Noll indices of the mean wavefront. On the LSST with 0.1 um of aberration Z12 to Z15 move ellipticities by 5e-4 (rms)
@@ -38,11 +39,6 @@ _SAMPLES = 4.5
 #: Most samples on a side.
 _MOST_SAMPLES = 2048
 _LEAST_SAMPLES = 16
-#: Rings and spokes of lags, between which covariances are interpolated.
-_RINGS = 18
-_SPOKES = 20
-#: First scale of the rings, in the angle of the pupil at the highest layer.
-_FIRST_RING = 0.3
 #: Side of the grid of a layer over the outer scale or the pupil, at least: longer modes are left out.
 _LAYER_SIDE = 8.0
 #: Largest frequency of the mean wavefront times the diameter of the pupil, and that of tables, from zero in so many
@@ -152,20 +148,13 @@ def moment_spectrum(
     last result are the share of the variances that aberrations of the optics add, and the power of the lit fraction
     that they go as, [2, 3].
     """
-    ends = 0.5 * math.sqrt(2.0) * grid.side
-    highest = max(air.altitudes, default=0.0)
-    unit = _FIRST_RING * air.diameter / highest if highest else ends
-    step = math.log1p(ends / unit) / (_RINGS - 2)
-    radius = unit * np.expm1(step * np.arange(_RINGS))
-    angle = math.pi * np.arange(_SPOKES) / _SPOKES
-    lags = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    # The first ring is the lag zero.
-    lags = np.concatenate([lags[0, :1], lags[1:].reshape(-1, 2)])
+    polar_lags = PolarLags.of(air, 0.5 * math.sqrt(2.0) * grid.side)
+    lags = polar_lags.lags
     of_orders = moment_covariance(air, lags, response.aberration, response.lit)
     covariances = of_orders.total(response)
-    polar = np.concatenate([np.repeat(covariances[:1], _SPOKES, axis=0), covariances[1:]]).reshape(_RINGS, _SPOKES, 6)
+    polar = polar_lags.table(covariances)
     # What stars half a period apart share, all stars do.
-    shared = _positive(as_matrices(polar[np.searchsorted(radius, 0.5 * grid.side)].mean(axis=0)))
+    shared = _positive(as_matrices(polar[np.searchsorted(polar_lags.radius, 0.5 * grid.side)].mean(axis=0)))
     scale = float(polar[0, 0, 2])
     constant = np.array([shared[i, j] for i, j in PAIRS])
     half = grid.size // 2 + 1
@@ -175,8 +164,8 @@ def moment_spectrum(
         half,
         [
             warp_array((polar - constant) / scale, pairs),
-            grid.side / grid.size / unit,
-            step,
+            grid.side / grid.size / polar_lags.unit,
+            polar_lags.step,
             warp_array(covariance, wp.float32),
         ],
     )

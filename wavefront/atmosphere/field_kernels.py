@@ -29,6 +29,27 @@ def cubic_weights(part: wp.float32):
     return wp.vec4f(before, first, second, after)
 
 
+@wp.func
+def at_lag(x: wp.float32, y: wp.float32, polar: wp.array2d(dtype=pairs), step: wp.float32):
+    """Covariances at a lag between rings and spokes [ring, spoke], see :func:`spread_over_grid`."""
+    n_ring = polar.shape[0]
+    n_spoke = polar.shape[1]
+    ring = wp.log(wp.float32(1.0) + wp.sqrt(x * x + y * y)) / step
+    spoke = wp.atan2(y, x) / wp.float32(wp.PI) * wp.float32(n_spoke)
+    before_ring = wp.min(wp.int32(ring), n_ring - 3)
+    before_spoke = wp.int32(wp.floor(spoke))
+    along = cubic_weights(ring - wp.float32(before_ring))
+    around = cubic_weights(spoke - wp.float32(before_spoke))
+    value = pairs()
+    for i in range(4):
+        # On the other side of the centre the rings come in reverse, with the same values.
+        k = wp.abs(before_ring + i - 1)
+        for j in range(4):
+            m = (before_spoke + j - 1 + n_spoke) % n_spoke
+            value = value + along[i] * around[j] * polar[k, m]
+    return value
+
+
 @wp.kernel
 def spread_over_grid(
     first: wp.int32,
@@ -45,27 +66,29 @@ def spread_over_grid(
     """
     row = first + wp.tid()
     size = grid.shape[2]
-    n_ring = polar.shape[0]
-    n_spoke = polar.shape[1]
     y = per_spacing * wp.float32(row)
     for column in range(size):
         signed = wp.where(column > size / 2, column - size, column)
         x = per_spacing * wp.float32(signed)
-        ring = wp.log(wp.float32(1.0) + wp.sqrt(x * x + y * y)) / step
-        spoke = wp.atan2(y, x) / wp.float32(wp.PI) * wp.float32(n_spoke)
-        before_ring = wp.min(wp.int32(ring), n_ring - 3)
-        before_spoke = wp.int32(wp.floor(spoke))
-        along = cubic_weights(ring - wp.float32(before_ring))
-        around = cubic_weights(spoke - wp.float32(before_spoke))
-        value = pairs()
-        for i in range(4):
-            # On the other side of the centre the rings come in reverse, with the same values.
-            k = wp.abs(before_ring + i - 1)
-            for j in range(4):
-                m = (before_spoke + j - 1 + n_spoke) % n_spoke
-                value = value + along[i] * around[j] * polar[k, m]
+        value = at_lag(x, y, polar, step)
         for pair in range(6):
             grid[pair, row, column] = value[pair]
+
+
+@wp.kernel
+def read_lags(
+    first: wp.int32,
+    lags: wp.array(dtype=wp.vec2f),
+    polar: wp.array2d(dtype=pairs),
+    step: wp.float32,
+    values: wp.array2d(dtype=wp.float32),
+):
+    """Interpolate covariances from rings and spokes to lags in their unit; values [pair, lag]."""
+    n = first + wp.tid()
+    lag = lags[n]
+    value = at_lag(lag[0], lag[1], polar, step)
+    for pair in range(6):
+        values[pair, n] = value[pair]
 
 
 @wp.func

@@ -99,6 +99,46 @@ def mean_wavefront_covariance(
     return covariance
 
 
+def covariance_by_wavefront(air: ExposedAir, lags: np.ndarray, noll: ArrayLike, products: np.ndarray) -> np.ndarray:
+    """Return covariances of quantities that are linear in the mean wavefront of layers above the ground.
+
+    Parameters
+    ----------
+    air : ExposedAir
+        The exposure.
+    lags : ndarray, shape [n_lag, 2]
+        Field slopes from one star to the other [rad].
+    noll : array_like of int, shape [n_noll]
+        Noll indices, from 4.
+    products : ndarray, shape [n_pair, n_noll, n_noll]
+        Products of the derivatives of both quantities of a pair with respect to the coefficients [1/m^2].
+
+    Returns
+    -------
+    ndarray, shape [n_lag, n_pair]
+        Mean over a lag and its opposite.
+    """
+    low, high, count = _FREQUENCIES
+    frequency, angle = np.geomspace(low, high, count) / air.diameter, _directions()
+    plane = (frequency[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
+    indices = tuple(np.atleast_1d(np.asarray(noll, dtype=np.int64)).tolist())
+    transform = _zernike_transforms(indices, air.obscuration).reshape(len(plane), len(indices))
+    area = 2.0 * (np.log(high / low) / (count - 1)) * (np.pi / _DIRECTIONS) * frequency**2
+    power = np.repeat(area * path_spectrum(frequency, air.r0, air.outer_scale), _DIRECTIONS)
+    spectra = np.stack([((transform @ matrix) * transform.conj()).sum(axis=1).real for matrix in products], axis=1)
+    spectra *= power[:, None]
+    out = np.zeros((len(lags), len(products)))
+    for altitude, weight, velocity in zip(air.altitudes, air.weights, air.velocities, strict=True):
+        distance = altitude * lags
+        near = np.flatnonzero(np.hypot(*distance.T) <= _INDEPENDENT * air.outer_scale)
+        if altitude == 0.0:
+            continue
+        drifted = weight * np.sinc(plane @ (np.array(velocity) * air.exposure))[:, None] ** 2 * spectra
+        for some in np.array_split(near, max(1, len(near) // 16)):
+            out[some] += np.cos(2.0 * np.pi * (distance[some] @ plane.T)) @ drifted
+    return out
+
+
 @lru_cache(maxsize=2)
 def _zernike_transforms(indices: tuple[int, ...], obscuration: float) -> np.ndarray:
     """Return means over the annulus of Zernikes times a plane wave, [n_frequency, n_angle, n_noll].

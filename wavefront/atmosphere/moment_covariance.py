@@ -48,21 +48,10 @@ COMPONENTS = ("p", "q", "s")
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 #: Shortest exposure whose moments are Gaussian [s]: below it few speckles add up.
 LEAST_EXPOSURE = 5.0
-# Spacing of the baselines at each delay [m]: their lattice is shifted from one to the next, so that together they lie
-# much closer.
-_SPACING = 1.4
-# The same at delays near zero [m].
-_NEAR_SPACING = 0.7
-# Largest drift of a layer from one delay to the next [m].
-_DRIFT = 1.4
-# The same near zero [m].
-_NEAR_DRIFT = 0.5
 # Drift up to which delays count as near zero [m]: peaks of the slopes' covariance are narrower.
 _NEAR = 8.0
 # Distance from the pupil's rim from which on the slopes of a layer, a hundredth of theirs, vary little over it [m].
 _DISTANT = 8.0
-# Fewest delays on either side of zero.
-_LEAST_DELAYS = 64
 # Steps of the shift of the lattice, in parts of its spacing: of the plastic number (Roberts 2018), which fill a square
 # evenly.
 _PLASTIC = 1.32471795724474602596
@@ -73,6 +62,25 @@ _SIXTH = np.array([1.0 / 96.0, 1.0 / 96.0, 1.0 / 144.0])
 _THIRD = np.array([2.0 / 3.0, 2.0 / 3.0, 1.0 / 2.0])
 # Slopes in microradians: the fourth powers of their covariances, in radians, are below the least number of float32.
 _MICRO = 1e-6
+
+
+class MomentSampling(NamedTuple):
+    """Baselines of the pupil, and delays between moments of the exposure, of which covariances are sums."""
+
+    #: Spacing of the baselines at each delay [m]: their lattice is shifted from one to the next, so that together they
+    #: lie much closer.
+    spacing: float = 1.4
+    near_spacing: float = 0.7  #: the same at delays near zero [m]
+    drift: float = 1.4  #: largest drift of a layer from one delay to the next [m]
+    near_drift: float = 0.5  #: the same near zero [m]
+    least_delays: int = 64  #: on either side of zero
+    #: Wind that the delays are chosen for [m/s]; by default the fastest. With one for all winds, covariances are smooth
+    #: functions of them.
+    wind: float | None = None
+
+
+#: Sampling of covariances within a per cent, half-variograms at 1' among them.
+FINE = MomentSampling()
 
 
 class ExposedAir(NamedTuple):
@@ -197,12 +205,13 @@ def moment_covariance(
     aberration: tuple[float, ...] = (0.0,),
     lit: tuple[float, ...] = (1.0,),
     threads: int | None = None,
+    sampling: MomentSampling = FINE,
 ) -> MomentCovariance:
     """Return the covariances of the moments of two stars whose field slopes are lags [n, 2] [rad] apart.
 
     Aberration and lit pairs are those of :class:`MomentResponse`.
     """
-    lag, delays = np.asarray(lags, dtype=np.float64).reshape(-1, 2), _Delays.of(air, aberration, lit)
+    lag, delays = np.asarray(lags, dtype=np.float64).reshape(-1, 2), _Delays.of(air, aberration, lit, sampling)
     # All stars share the layers on the ground.
     ground = np.zeros(delays.baseline.shape, dtype=np.float32)
     _, common = _averages(air.on_ground(), np.zeros((1, 2)), delays, np.zeros((0, TERMS)), ground, threads)
@@ -263,13 +272,18 @@ class _Delays:
     baseline: np.ndarray
 
     @classmethod
-    def of(cls, air: ExposedAir, aberration: tuple[float, ...], lit: tuple[float, ...]) -> Self:
+    def of(
+        cls, air: ExposedAir, aberration: tuple[float, ...], lit: tuple[float, ...], sampling: MomentSampling
+    ) -> Self:
         """Return those of an exposure: dense near zero, where the slopes of all layers vary most."""
-        fastest = max((math.hypot(x, y) for x, y in air.velocities), default=0.0)
+        fastest = sampling.wind
+        if fastest is None:
+            fastest = max((math.hypot(x, y) for x, y in air.velocities), default=0.0)
         near = min(_NEAR / max(fastest, 1e-9), 0.5 * air.exposure)
-        near_count = max(_LEAST_DELAYS // 2, math.ceil(near * fastest / min(_NEAR_DRIFT, air.diameter / 16.0)))
+        near_drift, drift = min(sampling.near_drift, air.diameter / 16.0), min(sampling.drift, air.diameter / 4.0)
+        near_count = max(sampling.least_delays // 2, math.ceil(near * fastest / near_drift))
         far = air.exposure - near
-        far_count = max(_LEAST_DELAYS, math.ceil(far * fastest / min(_DRIFT, air.diameter / 4.0)))
+        far_count = max(sampling.least_delays, math.ceil(far * fastest / drift))
         inner, outer = np.linspace(0.0, near, near_count + 1), np.linspace(near, air.exposure, far_count + 1)
         edges = np.concatenate([inner[:-1], outer])
         edges = np.concatenate([-edges[:0:-1], edges])
@@ -277,7 +291,8 @@ class _Delays:
         weight = (1.0 - np.abs(time) / air.exposure) * width
         near_by = np.abs(time) < near
         lattices = [
-            _pupil_baselines(air.diameter, air.obscuration, spacing, len(time)) for spacing in (_SPACING, _NEAR_SPACING)
+            _pupil_baselines(air.diameter, air.obscuration, spacing, len(time))
+            for spacing in (sampling.spacing, sampling.near_spacing)
         ]
         sets = [lattices[int(n)][k] for k, n in enumerate(near_by)]
         start = np.concatenate([[0], np.cumsum([len(points) for points in sets])])

@@ -176,16 +176,14 @@ class LongExposureRenderer(PsfRenderer):
         plane = self._plane
         return max(GRID_MARGIN * (plane.size - plane.room), plane.size) * plane.pixel_size
 
-    def _turbulence(self, baseline: np.ndarray, wavelengths: np.ndarray | None = None) -> np.ndarray:
+    def _turbulence(self, baseline: np.ndarray) -> np.ndarray:
         """Return the mean transfer function of the atmosphere at baselines [m] of all wavelengths, or of each.
 
-        Baselines have the shape [n] or [n_wave, n], the result has [n_wave, n]; wavelengths [m] are those of the
-        renderer by default.
+        Baselines have the shape [n] or [n_wave, n], the result has [n_wave, n].
         """
         air = self._atmosphere
         assert air is not None, "the engine needs one"
-        waves = self._wavelengths if wavelengths is None else wavelengths
-        return coherence(structure_function(baseline, air.r0, air.outer_scale), waves[:, None])
+        return coherence(structure_function(baseline, air.r0, air.outer_scale), self._wavelengths[:, None])
 
     def _transfer_bounds(self, longest: float) -> np.ndarray:
         """Return the largest transfer of atmosphere and detector at each frequency up to a baseline [m], [n_wave, n].

@@ -358,6 +358,5 @@ class _MomentsOfExposure(_Moments, StatisticalRenderer):
 class _MomentsOfOptics(_Moments):
     """Moments of the optics alone, under a weight that is wide enough."""
 
-    def _turbulence(self, baseline: np.ndarray, wavelengths: np.ndarray | None = None) -> np.ndarray:
-        waves = self._wavelengths if wavelengths is None else wavelengths
-        return np.ones((len(waves), np.shape(baseline)[-1]))
+    def _turbulence(self, baseline: np.ndarray) -> np.ndarray:
+        return np.ones((len(self._wavelengths), np.shape(baseline)[-1]))

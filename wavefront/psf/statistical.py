@@ -30,17 +30,16 @@ from ...core.warp_arrays import warp_array
 from ...models.zernike_polynomials import annular_zernike_gradients
 from ..aberration import ResidualWavefront
 from ..atmosphere.exposure_fields import NOLL, ExposureFields, draw_exposure
-from ..atmosphere.moment_covariance import LEAST_EXPOSURE, ExposedAir, MomentResponse
-from ..atmosphere.turbulence import diffraction_otf
+from ..atmosphere.moment_covariance import LEAST_EXPOSURE, ExposedAir
 from ..pupil_optics import PupilOptics, trace_pupils
 from .clear_pupil import SpokePupil
 from .engine import ExposedStars, PsfInputs, Stars
 from .far_from_focus import blur_radii, check_stamp
 from .field_optics import FieldOptics, field_optics
-from .image_plane import square_transfer
 from .lattice_pupil import RINGS_POINTS
 from .long_exposure import LongExposureEngine, LongExposureRenderer
 from .mean_rays import FAR_ANGLE
+from .moment_response import moment_response
 from .pupil_means import PupilMeans
 from .sample_packets import samples
 from .spectral_rule import spectral_rule
@@ -48,9 +47,6 @@ from .statistical_kernels import blur_spectra
 
 #: FWHM of the weight under which moments of the fourth order have the same effect as the kernel [rad].
 MATCHED_FWHM = 0.7 * ARCSEC
-# Wavenumbers of the response, and the largest in units of one over the weight's rms width.
-_WAVENUMBERS = 512
-_HIGHEST = 6.0
 # Points along the radius and the angle of means over the pupil: exact for the gradients of Z4 to Z15.
 _RADII = 16
 _ANGLES = 16
@@ -126,7 +122,7 @@ class StatisticalRenderer(LongExposureRenderer):
         self._base = inputs.aberration
         self._exposed_air = ExposedAir.of(air, telescope.pupil_diameter, telescope.pupil_obscuration)
         # Whichever wavelengths stand for those of the light, the exposure drawn is one.
-        self._light = inputs.wavelengths
+        self._asked = inputs
         self._rule = None if inputs.has_spectra else spectral_rule(inputs, self.depths)
         super().__init__(inputs if self._rule is None else self._rule.inputs(inputs), options)
         self._pupil_means = PupilMeans.of(inputs)
@@ -138,24 +134,8 @@ class StatisticalRenderer(LongExposureRenderer):
         """Fields of the exposure."""
         air = self._inputs.atmosphere
         assert air is not None
-        return draw_exposure(
-            self._exposed_air, self._response(), self._inputs.telescope.field_radius, air.seed, air.epoch
-        )
-
-    def _response(self) -> MomentResponse:
-        """Return the response of ellipticity and size of the mean image, with the blur of the optics' aberrations."""
-        weight = MATCHED_FWHM / math.sqrt(8.0 * math.log(2.0))
-        k = np.linspace(0.0, _HIGHEST / weight, _WAVENUMBERS)
-        baseline = self._light[:, None] * k / (2.0 * math.pi)
-        diffraction = diffraction_otf(baseline, self._diameter, self._obscuration)
-        on_detector = k / self.focal_length
-        pixel = square_transfer(on_detector, 0.0 * k, self._plane.pixel_size)
-        spread = np.exp(-0.5 * (self._plane.diffusion**2 + self._plane.jitter**2) * on_detector**2)
-        mean = (self._turbulence(baseline, self._light) * diffraction).mean(axis=0)
-        aberration = self._pupil_means.aberration
-        spread = spread * np.exp(-0.25 * aberration[0] * k**2)
-        response = MomentResponse.of(k, mean * pixel * spread, weight)
-        return response._replace(aberration=aberration, lit=self._pupil_means.lit)
+        response = moment_response(self._asked, self._pupil_means, self.focal_length, MATCHED_FWHM)
+        return draw_exposure(self._exposed_air, response, self._inputs.telescope.field_radius, air.seed, air.epoch)
 
     def kernels(self, optics: PupilOptics) -> np.ndarray:
         """Return the Gaussian kernels of stars on the sky, xx, yy, xy [rad^2], [n_star, 3]."""
@@ -178,7 +158,7 @@ class StatisticalRenderer(LongExposureRenderer):
         photons = np.broadcast_to(self._rule.photons, (len(stars), len(self._rule.photons)))
         exposed = super()._expose(replace(stars, photons=photons))
         # Apertures cut all wavelengths alike.
-        lit = np.repeat(exposed.lit_fraction[:, :1], len(self._light), axis=1)
+        lit = np.repeat(exposed.lit_fraction[:, :1], len(self._asked.wavelengths), axis=1)
         return exposed._replace(lit_fraction=lit)
 
     def _exposed_spectra(self, spectrum: np.ndarray, optics: PupilOptics) -> np.ndarray:
