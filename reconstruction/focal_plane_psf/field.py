@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,16 @@ import numpy as np
 from ...core.statistics import RMS_PER_MAD
 from .covariance import Covariance, Places
 from .fit import ShapeData, columns_acting_on
-from .kriging import Neighbourhood, leave_one_out, map_on_threads, neighbourhood, neighbours_of
+from .kriging import (
+    NEIGHBOURS,
+    NEIGHBOURS_OF_ALL,
+    Neighbourhood,
+    leave_one_out,
+    map_on_threads,
+    neighbourhood,
+    neighbours_of,
+)
+from .layer_covariance import LayerCovariance, shape_groups
 from .likelihood import blocks_of
 from .mosaic import Mosaic
 from .optics_part import OpticsPart
@@ -31,8 +41,8 @@ class ShapeField:
         Stars.
     residuals : ndarray, shape [n, 3]
         Their shapes less those of the optics.
-    covariances : tuple of Covariance
-        Of e1, e2 and ln size.
+    covariances : tuple of Covariance or LayerCovariance
+        Of e1, e2 and ln size each, or one :class:`.LayerCovariance` of all three.
     optics : OpticsPart or None
         The optical part; None where there is no telescope.
     design : ndarray, shape [n, n_parameter, 3], or None
@@ -42,7 +52,7 @@ class ShapeField:
     mosaic: Mosaic
     data: ShapeData
     residuals: np.ndarray
-    covariances: tuple[Covariance, ...]
+    covariances: tuple[Covariance, ...] | tuple[LayerCovariance, ...]
     optics: OpticsPart | None = None
     design: np.ndarray | None = None
 
@@ -60,39 +70,57 @@ class ShapeField:
         if self.optics is not None:
             values += self.optics.shapes(places, threads)
         design = self.optics.design(places, values, threads) if variance and self.optics is not None else None
-        ccds = np.unique(places.ccd)
 
-        def job(ccd: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            at = np.flatnonzero(places.ccd == ccd)
+        def job(cell: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            center, at = cell
             change, spread = np.empty((len(at), 3)), np.zeros((len(at), 3))
-            stars = self._neighbours(ccd)
-            for shape in range(3):
-                near = self._neighbourhood(stars, shape)
-                between = self.covariances[shape].between(self.data.places[stars], places[at])
-                change[:, shape] = near.predict(between)
+            stars = neighbours_of(self.data.places, center, self._neighbour_count)
+            for shapes, covariance in shape_groups(self.covariances):
+                near = self._neighbourhood(covariance, stars, shapes)
+                between = covariance.between(self.data.places[stars], places[at])
+                change[:, shapes] = near.predict(between).reshape(-1, len(at)).T
                 if variance:
                     weights = near.weights(between)
-                    spread[:, shape] = self.covariances[shape].at(places[at]) - (between * weights).sum(axis=0)
+                    left = covariance.at(places[at]) - (between * weights).sum(axis=0)
+                    spread[:, shapes] = left.reshape(-1, len(at)).T
                     if design is not None:
-                        spread[:, shape] += self._optics_variance(ccd, shape, design[at, :, shape], stars, weights)
+                        ccd = int(places.ccd[at[0]])
+                        spread[:, shapes] += self._optics_variance(ccd, shapes, design[at], stars, weights)
             return at, change, spread
 
         variances = np.empty((len(places), 3)) if variance else None
-        for at, change, spread in map_on_threads(job, ccds, threads):
+        for at, change, spread in map_on_threads(job, self._cells(places), threads):
             values[at] += change
             if variances is not None:
                 variances[at] = spread
         return values, variances
 
-    def _neighbours(self, ccd: int) -> np.ndarray:
-        return neighbours_of(self.data.places, self.mosaic.centers[ccd])
+    @property
+    def _neighbour_count(self) -> int:
+        return NEIGHBOURS_OF_ALL if len(self.covariances) == 1 else NEIGHBOURS
 
-    def _neighbourhood(self, stars: np.ndarray, shape: int) -> Neighbourhood:
-        values, noise = self.residuals[:, shape], self.data.noise[:, shape]
-        return neighbourhood(self.covariances[shape], self.data.places, values, noise, stars)
+    def _cells(self, places: Places) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the middle [m] of each CCD, or of each of its parts where it has many stars, and the places there."""
+        most, cells = self._neighbour_count // 2, []
+        for ccd in np.unique(places.ccd):
+            at = np.flatnonzero(places.ccd == ccd)
+            count = math.ceil(math.sqrt(np.count_nonzero(self.data.places.ccd == ccd) / most))
+            if count <= 1:
+                cells.append((self.mosaic.centers[ccd], at))
+                continue
+            part = np.clip(np.floor(0.5 * count * (places.uv[at] + 1.0)).astype(int), 0, count - 1)
+            for number in np.unique(part[:, 0] * count + part[:, 1]):
+                middle = (2.0 * np.array(divmod(int(number), count)) + 1.0) / count - 1.0
+                cells.append((self.mosaic.from_uv(ccd, middle), at[part[:, 0] * count + part[:, 1] == number]))
+        return cells
+
+    def _neighbourhood(
+        self, covariance: Covariance | LayerCovariance, stars: np.ndarray, shapes: slice
+    ) -> Neighbourhood:
+        return neighbourhood(covariance, self.data.places, self.residuals[:, shapes], self.data.noise[:, shapes], stars)
 
     def _optics_variance(
-        self, ccd: int, shape: int, design: np.ndarray, stars: np.ndarray, weights: np.ndarray
+        self, ccd: int, shapes: slice, design: np.ndarray, stars: np.ndarray, weights: np.ndarray
     ) -> np.ndarray:
         """Return the variance by uncertain optics that remains after correction by the neighbouring stars."""
         assert self.optics is not None
@@ -105,33 +133,35 @@ class ShapeField:
             first = common + int(np.searchsorted(ccds, of)) * width
             return np.r_[:common, first : first + width, len(used) - N_EXPOSURE : len(used)]
 
-        sensitivity = np.zeros((len(design), len(used)))
-        sensitivity[:, columns(ccd)] = design
-        for star_ccd in np.unique(at):
-            rows = at == star_ccd
-            sensitivity[:, columns(star_ccd)] -= weights[rows].T @ self.design[stars[rows], :, shape]
         covariance = self.optics.covariance[np.ix_(used, used)].astype(np.float64)
-        return np.asarray(((sensitivity @ covariance) * sensitivity).sum(axis=1))
+        numbers = range(3)[shapes]
+        # Weights of the stars' values of each shape in the predictions of each.
+        by_shape = weights.reshape(len(numbers), len(stars), len(numbers), len(design))
+        out = np.empty((len(design), len(numbers)))
+        for k, shape in enumerate(numbers):
+            sensitivity = np.zeros((len(design), len(used)))
+            sensitivity[:, columns(ccd)] = design[:, :, shape]
+            for star_ccd in np.unique(at):
+                rows = at == star_ccd
+                for of_stars, weighted in zip(numbers, by_shape[:, rows, k], strict=True):
+                    sensitivity[:, columns(star_ccd)] -= weighted.T @ self.design[stars[rows], :, of_stars]
+            out[:, k] = ((sensitivity @ covariance) * sensitivity).sum(axis=1)
+        return out
 
     def leave_one_out_residuals(self, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return shapes minus leave-one-out predictions, and their variances, each of shape [n, 3].
+        """Return shapes minus leave-one-out predictions, and their variances, each of shape [n, 3]."""
+        places = self.data.places
 
-        NaN for the farthest stars of a CCD with more stars than a neighbourhood holds.
-        """
-        ccds = np.unique(self.data.places.ccd)
-
-        def job(ccd: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            stars = self._neighbours(ccd)
-            on_ccd = self.data.places.ccd[stars] == ccd
-            pairs = [leave_one_out(self._neighbourhood(stars, shape)) for shape in range(3)]
-            return (
-                stars[on_ccd],
-                np.stack([p[0][on_ccd] for p in pairs], axis=1),
-                np.stack([p[1][on_ccd] for p in pairs], axis=1),
-            )
+        def job(cell: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            center, at = cell
+            stars = np.union1d(neighbours_of(places, center, self._neighbour_count), at)
+            mine = np.searchsorted(stars, at)
+            groups = shape_groups(self.covariances)
+            pairs = [leave_one_out(self._neighbourhood(c, stars, shapes)) for shapes, c in groups]
+            return at, *(np.concatenate([p[k][mine] for p in pairs], axis=1) for k in range(2))
 
         residuals, variance = np.full((2, len(self.data), 3), np.nan)
-        for at, difference, spread in map_on_threads(job, ccds, threads):
+        for at, difference, spread in map_on_threads(job, self._cells(places), threads):
             residuals[at], variance[at] = difference, spread
         return residuals, variance
 
@@ -141,11 +171,10 @@ class ShapeField:
 
         def job(index: np.ndarray) -> np.ndarray:
             values = []
-            for shape, covariance in enumerate(self.covariances):
-                near = neighbourhood(covariance, data.places, self.residuals[:, shape], data.noise[:, shape], index)
-                block_residuals, variance = leave_one_out(near)
+            for shapes, covariance in shape_groups(self.covariances):
+                block_residuals, variance = leave_one_out(self._neighbourhood(covariance, index, shapes))
                 values.append(block_residuals / np.sqrt(variance))
-            return np.stack(values, axis=1)
+            return np.concatenate(values, axis=1)
 
         blocks = blocks_of(data.places.xy)
         deviation = np.empty((len(data), 3))

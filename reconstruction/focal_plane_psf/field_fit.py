@@ -15,7 +15,7 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import BudgetName, HeightBudget
 from ...models.telescope import Telescope
 from .field import ShapeField
-from .fit import SHAPES, ExposureFit, ShapeData
+from .fit import SHAPES, ExposureFit, ShapeData, Turbulence
 from .heights import HeightPrior
 from .kriging import map_on_threads
 from .likelihood import CovarianceFit, fit_covariance, log_likelihood
@@ -56,6 +56,7 @@ def fit_field(
     instrument: Instrument | None,
     prior: HeightPrior | None,
     alignment_rms: float,
+    turbulence: Turbulence,
     threads: int | None,
     reporter: Reporter,
 ) -> FittedField:
@@ -74,10 +75,10 @@ def fit_field(
             ShapeField(mosaic, data, data.values, tuple(s.covariance for s in statistics)), np.nan, bounds
         )
     fit = ExposureFit(data, instrument, prior, alignment_rms, threads, reporter)
-    solution = fit.run()
+    solution = fit.run(turbulence)
     with one_blas_thread():
         evidence = fit.log_evidence() - sum(
-            log_likelihood(s.covariance, data.places, data.values[:, i], data.noise[:, i], fit.blocks)
+            log_likelihood(s.covariance, data.places, data.values[:, i : i + 1], data.noise[:, i : i + 1], fit.blocks)
             for i, s in enumerate(statistics)
         )
     slopes, columns = fit.derivatives()

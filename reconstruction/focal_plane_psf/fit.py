@@ -12,8 +12,9 @@ uncertain parameters marginalised.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -22,14 +23,18 @@ from ...core.progress import Reporter
 from ...core.threads import one_blas_thread
 from ...models.camera.focal_plane import FocalPlane
 from ...wavefront.aberration import ResidualWavefront
+from ...wavefront.atmosphere.moment_covariance import ExposedAir
 from ..gaussian_field import inverse_from_cholesky
 from .covariance import Covariance, Places
 from .heights import HeightPrior
 from .kriging import map_on_threads
+from .layer_covariance import LayerCovariance, in_order, shape_groups
+from .layer_fit import LayerFit, LayerTheory, mean_products
 from .likelihood import CovarianceFit, blocks_of, fit_covariance, log_likelihood
 from .response import (
     LARGEST_HEIGHT,
     N_EXPOSURE,
+    NOLL,
     ExposureResponse,
     Instrument,
     exposure_sigma,
@@ -37,6 +42,9 @@ from .response import (
     wavefront,
 )
 
+#: Covariances of turbulence: fitted exponentials of each shape; theory of layers with fitted winds, all shapes
+#: together; the same with winds near those of the instrument's atmosphere.
+Turbulence = Literal["exponential", "layers", "forecast"]
 #: Names of the shape parameters.
 SHAPES = ("e1", "e2", "ln size")
 # Standard deviation of the wavefront coefficients of an aligned telescope [m].
@@ -128,6 +136,11 @@ def _design_columns(terms: np.ndarray, slopes: np.ndarray, columns: np.ndarray) 
     return design
 
 
+def _design_of_shapes(terms: np.ndarray, slopes: np.ndarray, columns: np.ndarray, shapes: slice) -> np.ndarray:
+    """Return derivatives of some shapes, one after the other, of slopes [n, 3] and columns [n, 25, 3]."""
+    return np.concatenate([_design_columns(terms, slopes[:, k], columns[..., k]) for k in range(3)[shapes]])
+
+
 class ExposureFit:
     """Gauss-Newton fit of one exposure; :meth:`run` performs all steps."""
 
@@ -152,7 +165,7 @@ class ExposureFit:
         self.heights = np.zeros(prior.n_parameter)
         self.exposure = np.zeros(N_EXPOSURE)
         self._center = float(np.mean(prior.heights(self.heights, data.places)))
-        self.covariances: list[Covariance] = []
+        self.covariances: list[Covariance] | list[LayerCovariance] = []
         self.at_bounds: tuple[str, ...] = ()
         self.covariance: np.ndarray | None = None
         self._log_determinant = 0.0
@@ -224,6 +237,7 @@ class ExposureFit:
     def fit_covariances(self, max_iterations: int = 8) -> None:
         """Fit the covariances of turbulence to the residuals of the optics, with their uncertainty (one step of EM)."""
         residuals, slopes, columns = self._columns()
+        covariances = [c for c in self.covariances if isinstance(c, Covariance)]
 
         def fit(shape: int) -> CovarianceFit:
             def spread(index: np.ndarray) -> np.ndarray:
@@ -237,7 +251,7 @@ class ExposureFit:
                 residuals[:, shape],
                 self.data.noise[:, shape],
                 spread=spread if self.covariance is not None else None,
-                start=self.covariances[shape] if self.covariances else None,
+                start=covariances[shape] if covariances else None,
                 constant=_MEAN[shape] ** 2,
                 max_iterations=max_iterations,
             )
@@ -245,6 +259,48 @@ class ExposureFit:
         covariance_fits: list[CovarianceFit] = map_on_threads(fit, range(3), self.threads)
         self.covariances = [f.covariance for f in covariance_fits]
         self.at_bounds = tuple(f"{n} of {SHAPES[i]}" for i, f in enumerate(covariance_fits) for n in f.at_bounds)
+
+    def fit_layers(self, forecast: bool = False) -> None:
+        """Take the covariance from the theory of layers in place of the fitted ones, and solve for all with it.
+
+        Winds are searched in all directions, or with a forecast near those of the instrument's atmosphere.
+        """
+        instrument, telescope = self.instrument, self.instrument.telescope
+        air = ExposedAir.of(instrument.atmosphere, telescope.pupil_diameter, telescope.pupil_obscuration)
+        air = air._replace(r0=air.r0 * math.exp(float(self.exposure[-1])))
+        aberration = wavefront(telescope, self.exposure[:-1].reshape(3, -1), self._radius)
+        response, jacobian = instrument.moment_response(aberration, float(self.exposure[-1]), self.threads)
+        _, _, columns = self._columns()
+        # The coefficients on the axis are those of a star.
+        products = mean_products(columns[:, : len(NOLL)])
+        theory = LayerTheory(response, jacobian, products, self.prior.camera, self.threads)
+        layers = LayerFit(theory, air, self.data.places, np.square(_MEAN))
+        with self.reporter.stage("winds of the layers", total=layers.evaluations(forecast)) as stage:
+            self._observe(layers)
+            found = layers.search(forecast, stage.advance)
+        self.covariances = [found]
+        # As large as those of one shape.
+        self.blocks = blocks_of(self.data.places.xy, _BLOCK // 3)
+        with self.reporter.stage("heights, alignment and layers"):
+            self.solve(1)
+            self._observe(layers)
+            self.covariances = [layers.improve(found)]
+            self.solve(1)
+
+    def _observe(self, layers: LayerFit) -> None:
+        """Give the residuals of the optics, with their uncertainty, to a fit of layers."""
+        residuals, slopes, columns = self._columns()
+
+        def spread(index: np.ndarray) -> np.ndarray:
+            used, terms = self._terms(index)
+            design = _design_of_shapes(terms, slopes[index], columns[index], slice(0, 3))
+            assert self.covariance is not None
+            covariance = self.covariance[np.ix_(used, used)]
+            scale = np.sqrt(np.diagonal(covariance))
+            values, vectors = np.linalg.eigh(covariance / scale[:, None] / scale)
+            return design @ (scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+
+        layers.observe(residuals, self.data.noise, spread)
 
     def _terms(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the parameters that act on some stars, and their terms in the height, zero for the exposure's own."""
@@ -267,10 +323,10 @@ class ExposureFit:
             block_places = self.data.places[index]
             used, terms = self._terms(index)
             matrix, vector = np.zeros((len(used), len(used))), np.zeros(len(used))
-            for shape, covariance in enumerate(self.covariances):
-                design = _design_columns(terms, slopes[index, shape], columns[index, :, shape])
-                root = covariance.root(block_places, self.data.noise[index, shape])
-                design_and_residuals = np.column_stack([design, residuals[index, shape]])
+            for shapes, covariance in shape_groups(self.covariances):
+                design = _design_of_shapes(terms, slopes[index], columns[index], shapes)
+                root = covariance.root(block_places, in_order(self.data.noise[index], shapes))
+                design_and_residuals = np.column_stack([design, in_order(residuals[index], shapes)])
                 white = scipy.linalg.solve_triangular(root, design_and_residuals, lower=True, check_finite=False)
                 matrix += white[:, :-1].T @ white[:, :-1]
                 vector += white[:, :-1].T @ white[:, -1]
@@ -337,9 +393,10 @@ class ExposureFit:
         def of_block(index: np.ndarray) -> float:
             block_places = self.data.places[index]
             total = 0.0
-            for shape, covariance in enumerate(self.covariances):
-                root = covariance.root(block_places, self.data.noise[index, shape])
-                white = scipy.linalg.solve_triangular(root, residuals[index, shape], lower=True, check_finite=False)
+            for shapes, covariance in shape_groups(self.covariances):
+                root = covariance.root(block_places, in_order(self.data.noise[index], shapes))
+                ordered = in_order(residuals[index], shapes)
+                white = scipy.linalg.solve_triangular(root, ordered, lower=True, check_finite=False)
                 total += float(white @ white)
             return total
 
@@ -362,12 +419,12 @@ class ExposureFit:
         _, log_prior = np.linalg.slogdet(precision * scale[:, None] * scale)
         log_prior -= 2.0 * float(np.log(scale).sum())
         total = 0.5 * (log_prior - self._log_determinant - float(parameters @ precision @ parameters))
-        for shape, covariance in enumerate(self.covariances):
-            values, noise = residuals[:, shape], self.data.noise[:, shape]
+        for shapes, covariance in shape_groups(self.covariances):
+            values, noise = residuals[:, shapes], self.data.noise[:, shapes]
             total += log_likelihood(covariance, self.data.places, values, noise, self.blocks)
         return total
 
-    def run(self) -> OpticsFit:
+    def run(self, turbulence: Turbulence = "exponential") -> OpticsFit:
         """Fit everything."""
         self.linearise()
         with self.reporter.stage("heights, alignment and turbulence"):
@@ -385,6 +442,8 @@ class ExposureFit:
                 self.solve(1)
                 self.fit_covariances()
                 self.solve(1)
+        if turbulence != "exponential":
+            self.fit_layers(turbulence == "forecast")
         assert self.covariance is not None
         return OpticsFit(
             self.heights,

@@ -19,9 +19,12 @@ import scipy.linalg
 from ...core.threads import one_blas_thread, thread_count
 from ..gaussian_field import inverse_from_cholesky, leave_one_out_residuals
 from .covariance import Covariance, Places
+from .layer_covariance import LayerCovariance
 
-#: Stars that a prediction is made from.
+#: Stars that a prediction is made from, where each shape is predicted from itself.
 NEIGHBOURS = 700
+#: The same where all three shapes are predicted from all.
+NEIGHBOURS_OF_ALL = 300
 
 
 @dataclass(frozen=True)
@@ -32,9 +35,9 @@ class Neighbourhood:
     ----------
     stars : ndarray of int, shape [m]
         Indices of the stars.
-    root : ndarray, shape [m, m]
-        Lower Cholesky factor of their covariance.
-    alpha : ndarray, shape [m]
+    root : ndarray, shape [k m, k m]
+        Lower Cholesky factor of the covariance of k values of each, one kind after the other.
+    alpha : ndarray, shape [k m]
         Inverse covariance times the values.
     """
 
@@ -43,11 +46,11 @@ class Neighbourhood:
     alpha: np.ndarray
 
     def predict(self, between: np.ndarray) -> np.ndarray:
-        """Return predictions at places, of the covariance [m, n] between stars and places: shape [n]."""
+        """Return predictions at places, of the covariance [k m, n] between stars and places: shape [n]."""
         return between.T @ self.alpha
 
     def weights(self, between: np.ndarray) -> np.ndarray:
-        """Return the weights of the stars in the predictions, shape [m, n]."""
+        """Return the weights of the stars in the predictions, shape [k m, n]."""
         return scipy.linalg.cho_solve((self.root, True), between, check_finite=False)
 
 
@@ -60,17 +63,29 @@ def neighbours_of(places: Places, center: np.ndarray, count: int = NEIGHBOURS) -
 
 
 def neighbourhood(
-    covariance: Covariance, places: Places, values: np.ndarray, noise: np.ndarray, stars: np.ndarray
+    covariance: Covariance | LayerCovariance,
+    places: Places,
+    values: np.ndarray,
+    noise: np.ndarray,
+    stars: np.ndarray,
 ) -> Neighbourhood:
-    """Solve for the weights of stars of given indices; `noise` [n] are variances of all stars."""
-    root = covariance.root(places[stars], noise[stars])
-    return Neighbourhood(stars, root, scipy.linalg.cho_solve((root, True), values[stars], check_finite=False))
+    """Solve for the weights of stars of given indices; values and variances of their noise [n, k] are of all stars."""
+    root = covariance.root(places[stars], noise[stars].T.ravel())
+    return Neighbourhood(stars, root, scipy.linalg.cho_solve((root, True), values[stars].T.ravel(), check_finite=False))
 
 
 def leave_one_out(near: Neighbourhood) -> tuple[np.ndarray, np.ndarray]:
-    """Return value minus prediction of the other stars, and the variance of that, each of shape [m]."""
+    """Return values minus predictions by the other stars, and the variances of that, each of shape [m, k]."""
     inverse = inverse_from_cholesky(near.root)
-    return leave_one_out_residuals(near.alpha, inverse), 1.0 / np.diagonal(inverse)
+    m = len(near.stars)
+    k = len(inverse) // m
+    if k == 1:
+        residuals = leave_one_out_residuals(near.alpha, inverse)
+        return residuals[:, None], 1.0 / np.diagonal(inverse)[:, None]
+    star = np.arange(m)
+    # All values of a star are left out together.
+    own = np.linalg.inv(inverse.reshape(k, m, k, m)[:, star, :, star])
+    return np.einsum("mij,jm->mi", own, near.alpha.reshape(k, m)), np.diagonal(own, axis1=1, axis2=2)
 
 
 def map_on_threads(job: Callable[..., Any], items: Iterable[object], threads: int | None) -> list[Any]:

@@ -20,6 +20,7 @@ import scipy.linalg
 
 from ..gaussian_field import inverse_from_cholesky
 from .covariance import CCD_TERMS, COMPONENTS, Covariance, Places, ccd_terms
+from .layer_covariance import LayerCovariance
 
 #: Largest number of stars in a block.
 BLOCK = 300
@@ -180,13 +181,17 @@ def fit_covariance(
 
 
 def log_likelihood(
-    covariance: Covariance, places: Places, values: np.ndarray, noise: np.ndarray, blocks: Sequence[np.ndarray]
+    covariance: Covariance | LayerCovariance,
+    places: Places,
+    values: np.ndarray,
+    noise: np.ndarray,
+    blocks: Sequence[np.ndarray],
 ) -> float:
-    """Return the logarithm of the likelihood of values in blocks, without the constant of 2 pi."""
+    """Return the logarithm of the likelihood in blocks of shapes [n, k] that covary, without the constant of 2 pi."""
     total = 0.0
     for index in blocks:
-        root = covariance.root(places[index], noise[index])
-        white = scipy.linalg.solve_triangular(root, values[index], lower=True, check_finite=False)
+        root = covariance.root(places[index], noise[index].T.ravel())
+        white = scipy.linalg.solve_triangular(root, values[index].T.ravel(), lower=True, check_finite=False)
         total -= 0.5 * float(white @ white) + float(np.log(np.diagonal(root)).sum())
     return total
 

@@ -28,8 +28,9 @@ from .covariance import Covariance, Places
 from .field import ShapeField
 from .field_fit import LEAST_STARS, FittedField, fit_field, height_prior, mosaic_of
 from .file import ModelFields, model_hdus, read_model
-from .fit import SHAPES, ShapeData
+from .fit import SHAPES, ShapeData, Turbulence
 from .images import ResidualImages, with_shapes
+from .layer_covariance import LayerCovariance
 from .mosaic import Mosaic, PsfShapes
 from .optics_prior import OpticsPrior
 from .response import Instrument
@@ -109,6 +110,7 @@ class FocalPlanePsf(ModelFields, Result):
         camera: str | Camera | None = None,
         weight_fwhm: ArrayLike | None = None,
         prior: OpticsPrior | None = None,
+        turbulence: Turbulence = "exponential",
         components: int = 3,
         ccds: Sequence[str] | None = None,
         threads: int | None = None,
@@ -134,6 +136,10 @@ class FocalPlanePsf(ModelFields, Result):
             Weight of the moments [rad]; by default that of the stars. That of an instrument is not used.
         prior : OpticsPrior, optional
             Prior of unknown heights and of the residual wavefront; by default simulated heights and 0.2 um.
+        turbulence : {"exponential", "layers", "forecast"}
+            Covariance of what turbulence adds: two exponentials for each shape; or the theory of the layers of the
+            instrument's atmosphere, their winds and strengths fitted, for all shapes together; or the same with winds
+            near those of that atmosphere. Exposure time and altitudes are that atmosphere's.
         components : int
             Most principal components of the residual stamps.
         ccds : sequence of str, optional
@@ -158,6 +164,8 @@ class FocalPlanePsf(ModelFields, Result):
                 f"weight_fwhm = {weight / ARCSEC:.3g} arcsec: expected at least a pixel of the stamps,"
                 f" {catalogue.pixel_scale / ARCSEC:.3g} arcsec, and better 2.5 of them"
             )
+        if telescope is None and turbulence != "exponential":
+            raise DomainError(f"turbulence = {turbulence!r}: expected a telescope, through whose pupil the layers act")
         mosaic = mosaic_of(catalogue, telescope, focal_plane, camera)
         used = catalogue.usable
         if used.sum() < LEAST_STARS:
@@ -177,7 +185,7 @@ class FocalPlanePsf(ModelFields, Result):
         stamp_size = Stamps().size if instrument is None else instrument.stamps.size
         if catalogue.stamps is not None:
             stamp_size = catalogue.stamps.shape[1]
-        fitted = fit_field(mosaic, data, instrument, heights, prior.alignment_rms, threads, reporter)
+        fitted = fit_field(mosaic, data, instrument, heights, prior.alignment_rms, turbulence, threads, reporter)
         field = fitted.field
         with reporter.stage("stars against the others"):
             good = field.inliers(threads)
@@ -223,8 +231,8 @@ class FocalPlanePsf(ModelFields, Result):
         return self.field.mosaic
 
     @property
-    def covariances(self) -> tuple[Covariance, ...]:
-        """Covariances of what turbulence adds to e1, e2 and ln size."""
+    def covariances(self) -> tuple[Covariance, ...] | tuple[LayerCovariance, ...]:
+        """Covariances of what turbulence adds to e1, e2 and ln size: of each, or one of all with the layers found."""
         return self.field.covariances
 
     @property
@@ -364,9 +372,10 @@ def _fit_warnings(
             remarks.append(
                 f"reduced chi-square of {name} at the stars is {value:.2f}: the noise of the stars is not as stated"
             )
-    for covariance, noise, name in zip(field.covariances, field.data.noise.T, SHAPES, strict=True):
-        if covariance.nugget > _EXTRA_NOISE * np.median(noise):
-            ratio = np.sqrt(1.0 + covariance.nugget / np.median(noise))
+    nuggets = np.concatenate([np.atleast_1d(covariance.nugget) for covariance in field.covariances])
+    for nugget, noise, name in zip(nuggets, field.data.noise.T, SHAPES, strict=True):
+        if nugget > _EXTRA_NOISE * np.median(noise):
+            ratio = np.sqrt(1.0 + nugget / np.median(noise))
             remarks.append(f"the stars scatter {ratio:.1f} times as much in {name} as the stated noise")
     ccds = np.unique(field.data.places.ccd)
     if np.isfinite(fitted.evidence) and fitted.evidence < 0.0:

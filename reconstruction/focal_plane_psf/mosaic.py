@@ -107,6 +107,12 @@ class Mosaic:
             return Places(xy, ccd, self.camera.to_uv(ccd, xy))
         return Places(xy, ccd, (xy - self.centers[ccd]) / self.half_size)
 
+    def from_uv(self, ccd: int, uv: np.ndarray) -> np.ndarray:
+        """Return the position on the detector [m] of a place of a CCD in halves of its side, [2]."""
+        if self.camera is not None:
+            return self.camera.from_uv(ccd, uv)
+        return self.centers[ccd] + self.half_size * uv
+
 
 @dataclass(frozen=True, eq=False)
 class PsfShapes:

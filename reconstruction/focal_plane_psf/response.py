@@ -27,11 +27,15 @@ from ...models.telescope import Telescope
 from ...models.zernike_polynomials import noll_to_nm
 from ...wavefront.aberration import LINEAR_FRACTION, ResidualWavefront
 from ...wavefront.atmosphere.atmosphere import Atmosphere
-from ...wavefront.chief_rays import fields_at
+from ...wavefront.atmosphere.moment_covariance import MomentResponse
+from ...wavefront.chief_rays import fields_at, image_jacobians
 from ...wavefront.psf.clear_pupil import has_only_annuli
+from ...wavefront.psf.engine import center_focal_length
 from ...wavefront.psf.light import Light
 from ...wavefront.psf.long_exposure import LongExposureEngine
-from ...wavefront.psf.psf import make_psfs
+from ...wavefront.psf.moment_response import moment_response
+from ...wavefront.psf.psf import make_psfs, psf_inputs
+from ...wavefront.psf.pupil_means import PupilMeans
 from ...wavefront.psf.stamps import Stamps
 from .height_series import HeightSeries, level_plane
 
@@ -186,6 +190,23 @@ class Instrument:
             threads=threads,
         )
         return psfs.image, psfs.pixel_scale
+
+    def moment_response(
+        self, aberration: ResidualWavefront | None, seeing: float = 0.0, threads: int | None = None
+    ) -> tuple[MomentResponse, np.ndarray]:
+        """Return the response of the shapes to the moments of turbulence, on the mean over the field.
+
+        The second result are the positions on the detector by field slopes in the middle of the field [m], [2, 2].
+        """
+        atmosphere = replace(self.atmosphere, r0=self.atmosphere.r0 * float(np.exp(seeing)))
+        inputs, _ = psf_inputs(
+            self.telescope, np.zeros((1, 2)), self.light, None, atmosphere, aberration, self.stamps, threads
+        )
+        focal_length = center_focal_length(self.telescope, self.wavelengths, threads)
+        response = moment_response(inputs, PupilMeans.of(inputs), focal_length, self.weight_fwhm)
+        wavelength = self.wavelengths[len(self.wavelengths) // 2]
+        jacobian = image_jacobians(self.telescope, np.array([[0.0, 0.0, -1.0]]), wavelength, threads)[0]
+        return response, jacobian
 
     def shapes(
         self,

@@ -1,0 +1,350 @@
+r"""Winds and strengths of the layers of an exposure, from the shapes of its stars.
+
+The covariance of the shapes is that of theory (:class:`.LayerCovariance`); winds, strengths, Fried parameter and outer
+scale are those of the largest likelihood, with the layers of a site as prior: speeds and strengths within a third of
+theirs, winds from any direction. The likelihood is that of blocks of neighbouring stars, as in :mod:`.likelihood`. Its
+gradient follows the chain rule through a table of covariances at some lags, whose derivatives are differences.
+
+Winds of all layers turned around give the same covariances, and weak layers hardly matter: winds are found as far as
+they change the prediction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+
+from ...core.random_streams import stream
+from ...models.camera.camera import Camera
+from ...wavefront.atmosphere.mean_wavefront import covariance_by_wavefront
+from ...wavefront.atmosphere.moment_covariance import (
+    FINE,
+    PAIRS,
+    ExposedAir,
+    MomentResponse,
+    MomentSampling,
+    as_matrices,
+    moment_covariance,
+)
+from ...wavefront.atmosphere.polar_lags import PolarLags
+from ..gaussian_field import inverse_from_cholesky
+from .covariance import Places
+from .kriging import map_on_threads
+from .layer_covariance import LayerCovariance, in_blocks, in_order
+from .likelihood import blocks_of
+from .response import NOLL
+
+# Stars of a block of the likelihood, and most blocks: the strengths of layers are common to all.
+_BLOCK = 120
+_MOST_BLOCKS = 64
+# Sampling of the theory while winds are searched: covariances are right within a few per cent.
+_RINGS = 12
+_SPOKES = 12
+_COARSE = MomentSampling(near_spacing=1.4, drift=2.8, near_drift=1.0, least_delays=32)
+# Wind that it is chosen for, over the fastest of the prior.
+_FASTEST = 1.3
+# Directions of all winds that are tried first.
+_DIRECTIONS = 64
+# Standard deviations of the priors: logarithms of speeds, strengths, Fried parameter, outer scale and nuggets.
+_SPEED = 0.3
+_STRENGTH = 0.3
+_FRIED = 0.2
+_OUTER_SCALE = 0.3
+_NUGGET = 2.0
+# Unit of the components of winds [m/s], and least speed of a prior.
+_WIND = 10.0
+_LEAST_SPEED = 0.5
+# Step of the differences.
+_STEP = 0.02
+# Nugget over the variance: least, at the start, and most.
+_NUGGETS = (0.005, 0.02, 1.0)
+# Most steps of the search, and of one from a solution.
+_ITERATIONS = 15
+_AGAIN = 4
+
+
+@dataclass(frozen=True, eq=False)
+class LayerTheory:
+    """Covariances of the shapes of stars by a telescope in turbulence.
+
+    Attributes
+    ----------
+    response : MomentResponse
+        Of ellipticity and size to the moments of turbulence.
+    jacobian : ndarray, shape [2, 2]
+        Positions on the detector by field slopes [m].
+    products : ndarray, shape [6, n_noll, n_noll]
+        Products of the derivatives of two shapes with respect to Zernikes of the mean wavefront, on the mean over the
+        stars [1/m^2].
+    camera : Camera
+        Its size on the sky is the largest lag.
+    threads : int or None
+        Number of threads.
+    """
+
+    response: MomentResponse
+    jacobian: np.ndarray
+    products: np.ndarray
+    camera: Camera
+    threads: int | None
+
+    @property
+    def to_sky(self) -> np.ndarray:
+        """Field slopes by positions on the detector [1/m], [2, 2]."""
+        return np.asarray(np.linalg.inv(self.jacobian))
+
+    def reach(self, extent: float) -> float:
+        """Return the lag [rad] of a distance on the detector [m]."""
+        return float(np.linalg.norm(self.to_sky, 2)) * extent
+
+    def by_moments(self, air: ExposedAir, lags: np.ndarray, sampling: MomentSampling) -> np.ndarray:
+        """Return covariances of the shapes by the moments of turbulence, of PAIRS, [n_lag, 6]."""
+        response = self.response
+        covariance = moment_covariance(air, lags, response.aberration, response.lit, self.threads, sampling)
+        turned = _turn(self.jacobian)
+        shapes = turned @ response.shapes(as_matrices(covariance.total(response))) @ turned.T
+        return np.stack([shapes[:, i, j] for i, j in PAIRS], axis=1)
+
+    def by_wavefront(self, air: ExposedAir, lags: np.ndarray) -> np.ndarray:
+        """Return covariances of the shapes by the mean wavefront of the air and the optics' aberrations, [n_lag, 6]."""
+        return covariance_by_wavefront(air, lags, NOLL, self.products)
+
+    def covariance(self, air: ExposedAir, constant: np.ndarray, nugget: np.ndarray) -> LayerCovariance:
+        """Return the covariance function of an exposure."""
+        camera = self.camera
+        side = float(np.max(camera.half_sizes))
+        polar = PolarLags.of(air, self.reach(2.0 * (float(np.hypot(*camera.centers.T).max()) + math.sqrt(2.0) * side)))
+        values = self.by_moments(air, polar.lags, FINE) + self.by_wavefront(air, polar.lags)
+        return LayerCovariance(air, self.to_sky, polar, polar.table(values), constant, nugget)
+
+
+class LayerFit:
+    """Search for the winds of one exposure; :meth:`search` and :meth:`improve` return covariances.
+
+    Parameters
+    ----------
+    theory : LayerTheory
+        Covariances of an exposure.
+    prior : ExposedAir
+        Layers of the site.
+    places : Places
+        Of the stars.
+    constant : ndarray, shape [3]
+        Variances of the part of the shapes that all stars share.
+    """
+
+    def __init__(self, theory: LayerTheory, prior: ExposedAir, places: Places, constant: np.ndarray) -> None:
+        self._theory, self._prior, self._constant = theory, prior, constant
+        self._speeds = np.maximum(np.hypot(*np.array(prior.velocities).T), _LEAST_SPEED)
+        self._sampling = _COARSE._replace(wind=_FASTEST * float(self._speeds.max(initial=0.0)))
+        blocks = blocks_of(places.xy, _BLOCK)
+        chosen = np.unique(np.linspace(0, len(blocks) - 1, min(len(blocks), _MOST_BLOCKS)).astype(int))
+        #: Stars of each block of the likelihood.
+        self.blocks = [blocks[k] for k in chosen]
+        extent = max(float(np.hypot(*np.ptp(places.xy[block], axis=0))) for block in self.blocks)
+        self._lags = PolarLags.of(prior, theory.reach(extent), _RINGS, _SPOKES)
+        to_sky = theory.to_sky.T
+        self._weights = [
+            _interpolation(self._lags, ((places.xy[b][:, None] - places.xy[b]) @ to_sky).reshape(-1, 2))
+            for b in self.blocks
+        ]
+        self._data: list[_BlockData] = []
+        self._by_wavefront = np.zeros((len(self._lags.lags), len(PAIRS)))
+        self._variance = theory.by_moments(prior, np.zeros((1, 2)), FINE)[0, :3]
+
+    def observe(
+        self, values: np.ndarray, noise: np.ndarray, spread: Callable[[np.ndarray], np.ndarray] | None = None
+    ) -> None:
+        """Take residuals of all stars and the variances of their noise [n, 3].
+
+        ``spread`` returns a factor [3 m, k] of the covariance of the values of some stars due to fitted parameters.
+        """
+
+        def block(index: np.ndarray) -> _BlockData:
+            factor = in_order(values[index], slice(0, 3))[:, None]
+            if spread is not None:
+                factor = np.concatenate([factor, spread(index)], axis=1)
+            return _BlockData(in_order(noise[index], slice(0, 3)), factor)
+
+        self._data = map_on_threads(block, self.blocks, self._theory.threads)
+
+    def evaluations(self, forecast: bool) -> int:
+        """Return about how many likelihoods :meth:`search` computes."""
+        return _ITERATIONS + (1 if forecast else _DIRECTIONS)
+
+    def search(self, forecast: bool = False, advance: Callable[[int], None] | None = None) -> LayerCovariance:
+        """Find the winds, from the most likely of some random directions, or from those of the prior."""
+        velocities = [np.array(self._prior.velocities)]
+        if not forecast:
+            angle = stream(0, "directions of layers").uniform(0.0, 2.0 * np.pi, (_DIRECTIONS, len(self._speeds)))
+            velocities = list(self._speeds[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+        starts = [self._parameters(v) for v in velocities]
+        values = []
+        for start in starts:
+            values.append(self._likelihood(self._table(start), self._nugget(start), gradient=False)[0])
+            if advance is not None:
+                advance(1)
+        return self._climb(starts[int(np.argmax(values))], _ITERATIONS, advance)
+
+    def improve(self, covariance: LayerCovariance, advance: Callable[[int], None] | None = None) -> LayerCovariance:
+        """Find the winds from those of a covariance."""
+        start = self._parameters(np.array(covariance.air.velocities))
+        n, air = len(self._speeds), covariance.air
+        start[2 * n : 3 * n] = np.log(np.array(air.weights) / np.array(self._prior.weights))
+        start[3 * n] = math.log(air.r0 / self._prior.r0)
+        start[3 * n + 1] = math.log(air.outer_scale / self._prior.outer_scale)
+        start[3 * n + 2 :] = np.log(covariance.nugget / self._variance)
+        self._by_wavefront = self._theory.by_wavefront(air, self._lags.lags)
+        return self._climb(start, _AGAIN, advance)
+
+    def _climb(self, start: np.ndarray, steps: int, advance: Callable[[int], None] | None) -> LayerCovariance:
+        from scipy.optimize import minimize  # a fifth of a second
+
+        def objective(parameters: np.ndarray) -> tuple[float, np.ndarray]:
+            if advance is not None:
+                advance(1)
+            return self._negative_log_posterior(parameters)
+
+        bounds: list[tuple[float | None, float | None]] = [(None, None)] * (len(start) - 3)
+        low, _, high = np.log(_NUGGETS)
+        optimum = minimize(
+            objective,
+            start,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=[*bounds, *[(low, high)] * 3],
+            options={"maxiter": steps, "maxfun": 2 * steps, "ftol": 1e-6},
+        )
+        return self._theory.covariance(self._air(optimum.x), self._constant, self._nugget(optimum.x))
+
+    def _parameters(self, velocities: np.ndarray) -> np.ndarray:
+        """Return parameters of winds [n_layer, 2] [m/s], all else as in the prior.
+
+        They are winds, logarithms of the strengths of layers, of the Fried parameter, the outer scale and the nuggets.
+        """
+        n = len(velocities)
+        return np.concatenate([velocities.ravel() / _WIND, np.zeros(n + 2), np.full(3, math.log(_NUGGETS[1]))])
+
+    def _air(self, parameters: np.ndarray) -> ExposedAir:
+        n, prior = len(self._speeds), self._prior
+        strength = np.array(prior.weights) * np.exp(parameters[2 * n : 3 * n])
+        velocities = _WIND * parameters[: 2 * n].reshape(n, 2)
+        return prior._replace(
+            velocities=tuple((x, y) for x, y in velocities.tolist()),
+            weights=tuple((strength / strength.sum()).tolist()),
+            r0=prior.r0 * math.exp(parameters[3 * n]),
+            outer_scale=prior.outer_scale * math.exp(parameters[3 * n + 1]),
+        )
+
+    def _nugget(self, parameters: np.ndarray) -> np.ndarray:
+        return np.asarray(self._variance * np.exp(parameters[-3:]))
+
+    def _table(self, parameters: np.ndarray) -> np.ndarray:
+        """Return covariances at the lags, [n_lag, 6]."""
+        air = self._air(parameters)
+        return self._theory.by_moments(air, self._lags.lags, self._sampling) + self._by_wavefront
+
+    def _negative_log_posterior(self, parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return minus the logarithm of the likelihood times the priors, and its gradient."""
+        n = len(self._speeds)
+        nugget = self._nugget(parameters)
+        value, by_table, by_nugget = self._likelihood(self._table(parameters), nugget)
+        gradient = np.empty_like(parameters)
+        for k in range(len(parameters) - 3):
+            step = np.zeros_like(parameters)
+            step[k] = _STEP
+            change = self._table(parameters + step) - self._table(parameters - step)
+            gradient[k] = float((change * by_table).sum()) / (2.0 * _STEP)
+        gradient[-3:] = by_nugget * nugget
+        winds = _WIND * parameters[: 2 * n].reshape(n, 2)
+        speed = np.maximum(np.hypot(*winds.T), 1e-3)
+        faster = np.log(speed / self._speeds)
+        logarithms = parameters[2 * n :] - np.r_[np.zeros(n + 2), np.full(3, math.log(_NUGGETS[1]))]
+        width = np.r_[np.full(n, _STRENGTH), _FRIED, _OUTER_SCALE, np.full(3, _NUGGET)]
+        value -= 0.5 * float((faster**2).sum()) / _SPEED**2 + 0.5 * float(((logarithms / width) ** 2).sum())
+        gradient[: 2 * n] -= (_WIND * winds * (faster / (_SPEED * speed) ** 2)[:, None]).ravel()
+        gradient[2 * n :] -= logarithms / width**2
+        return -value, -gradient
+
+    def _likelihood(
+        self, table: np.ndarray, nugget: np.ndarray, *, gradient: bool = True
+    ) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return the logarithm of the likelihood, and its derivatives with respect to table and nuggets."""
+
+        def contribution(k: int) -> tuple[float, np.ndarray, np.ndarray]:
+            data, weights, m = self._data[k], self._weights[k], len(self.blocks[k])
+            matrix = in_blocks((weights @ table).T.reshape(-1, m, m), self._constant)
+            matrix[np.diag_indices(3 * m)] += data.noise + np.repeat(nugget, m)
+            root = scipy.linalg.cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
+            white = scipy.linalg.solve_triangular(root, data.factor, lower=True, check_finite=False)
+            value = -0.5 * float((white**2).sum()) - float(np.log(np.diagonal(root)).sum())
+            if not gradient:
+                return value, np.zeros(0), np.zeros(0)
+            inverse = inverse_from_cholesky(root)
+            weighted = inverse @ data.factor
+            slope = 0.5 * (weighted @ weighted.T - inverse)
+            by_block = slope.reshape(3, m, 3, m)
+            # Covariances of different shapes stand in two blocks.
+            by_pair = [(1.0 if i == j else 2.0) * by_block[i, :, j].ravel() for i, j in PAIRS]
+            by_nugget = np.diagonal(slope).reshape(3, m).sum(axis=1)
+            return value, weights.T @ np.stack(by_pair, axis=1), by_nugget
+
+        parts = map_on_threads(contribution, range(len(self.blocks)), self._theory.threads)
+        return sum(p[0] for p in parts), sum(p[1] for p in parts), sum(p[2] for p in parts)
+
+
+@dataclass(frozen=True, eq=False)
+class _BlockData:
+    noise: np.ndarray  #: variances, [3 m]
+    factor: np.ndarray  #: values, and a factor of their covariance due to fitted parameters, [3 m, 1 + k]
+
+
+def mean_products(columns: np.ndarray) -> np.ndarray:
+    """Return products of derivatives of PAIRS of shapes on the mean over stars, [6, k, k], of columns [n, k, 3]."""
+    products = [np.einsum("na,nb->ab", columns[..., i], columns[..., j]) / len(columns) for i, j in PAIRS]
+    return np.stack(products)
+
+
+def _turn(jacobian: np.ndarray) -> np.ndarray:
+    """Return shapes e1, e2, ln size on the detector by those on the sky, [3, 3]."""
+    turn = jacobian / math.sqrt(abs(np.linalg.det(jacobian)))
+    out = np.eye(3)
+    for k, moments in enumerate((np.diag([0.5, -0.5]), np.array([[0.0, 0.5], [0.5, 0.0]]))):
+        turned = turn @ moments @ turn.T
+        out[:2, k] = turned[0, 0] - turned[1, 1], 2.0 * turned[0, 1]
+    return out
+
+
+def _interpolation(lags: PolarLags, places: np.ndarray) -> scipy.sparse.csr_matrix:
+    """Return weights of the values at lags in those at places [n, 2] [rad]: Lagrange's cubics in ring and spoke."""
+    ring = np.log1p(np.hypot(*places.T) / lags.unit) / lags.step
+    spoke = np.arctan2(places[:, 1], places[:, 0]) / np.pi * lags.spokes
+    before_ring, before_spoke = np.minimum(ring.astype(int), lags.rings - 3), np.floor(spoke).astype(int)
+    around = np.arange(-1, 3)
+    # On the other side of the centre the rings come in reverse, with the same values.
+    rings = np.abs(before_ring[:, None] + around)[:, :, None]
+    spokes = ((before_spoke[:, None] + around) % lags.spokes)[:, None]
+    columns = np.where(rings == 0, 0, 1 + (rings - 1) * lags.spokes + spokes)
+    weight = _cubic(ring - before_ring)[:, :, None] * _cubic(spoke - before_spoke)[:, None]
+    shape = (len(places), 1 + (lags.rings - 1) * lags.spokes)
+    starts = np.arange(0, 16 * len(places) + 1, 16)
+    return scipy.sparse.csr_matrix((weight.ravel().astype(np.float32), columns.ravel(), starts), shape=shape)
+
+
+def _cubic(part: np.ndarray) -> np.ndarray:
+    """Return weights of the four values around places between the second and the third, [n, 4]."""
+    t = part
+    return np.stack(
+        [
+            t * (t - 1.0) * (2.0 - t) / 6.0,
+            (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0,
+            t * (t + 1.0) * (2.0 - t) / 2.0,
+            t * (t + 1.0) * (t - 1.0) / 6.0,
+        ],
+        axis=1,
+    )
