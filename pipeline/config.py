@@ -289,6 +289,11 @@ class ReconstructionConfig(Section):
     model: Literal["ccd", "focal_plane"] = Field(
         "ccd", description="ccd (each CCD by itself), focal_plane (one more model, of the shapes on all CCDs together)"
     )
+    turbulence: Literal["exponential", "layers"] = Field(
+        "exponential",
+        description="its covariance in the focal-plane model: exponential (fitted, each shape by itself), layers "
+        "(theory of the site's layers with fitted winds, all shapes together)",
+    )
     flag_stars: Switch = Field(
         False, description="leave out stars with neighbours, cosmic rays and saturated cores, as far as they are seen"
     )

@@ -71,6 +71,8 @@ def _check_reconstruction(config: Configuration, pixel_arcsec: float) -> None:
         )
     if fit.model == "focal_plane" and not config.atmosphere.enabled:
         raise ConfigError("reconstruction.model = focal_plane: expected atmosphere.enabled = true, whose mean it takes")
+    if fit.turbulence != "exponential" and fit.model != "focal_plane":
+        raise ConfigError(f"reconstruction.turbulence = {fit.turbulence}: expected model = focal_plane, whose it is")
 
 
 def _check_catalogue(stars: StarsConfig) -> None:

@@ -40,6 +40,9 @@ def hashed_content(config: Configuration) -> dict[str, Any]:
     content["focal_plane"] = hashed_heights(content["focal_plane"])
     content["active_optics"] = hashed_states(content["active_optics"])
     content["stars"] = hashed_stars(content["stars"])
+    if config.reconstruction.turbulence == "exponential":
+        # As in hashes from before this key.
+        del content["reconstruction"]["turbulence"]
     if config.pointing is None:
         del content["pointing"]
     content["atmosphere"]["site"] = _name_or_content(resolved_value(config.atmosphere.site), ())

@@ -146,6 +146,7 @@ def fit_focal_plane_model(
         heights = FocalPlane.flat(experiment.camera)
     residual = experiment.config.active_optics.residual_um * 1e-6
     prior = OpticsPrior(experiment.focal_plane.budget, float(np.hypot(residual, _AIR_WAVEFRONT)))
+    options["turbulence"] = experiment.config.reconstruction.turbulence
     return FocalPlanePsf.fit(stars, instrument_of(experiment), heights, prior=prior, **options)
 
 

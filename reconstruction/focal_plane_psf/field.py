@@ -52,7 +52,7 @@ class ShapeField:
     mosaic: Mosaic
     data: ShapeData
     residuals: np.ndarray
-    covariances: tuple[Covariance, ...] | tuple[LayerCovariance, ...]
+    covariances: tuple[Covariance | LayerCovariance, ...]
     optics: OpticsPart | None = None
     design: np.ndarray | None = None
 
@@ -158,7 +158,8 @@ class ShapeField:
             mine = np.searchsorted(stars, at)
             groups = shape_groups(self.covariances)
             pairs = [leave_one_out(self._neighbourhood(c, stars, shapes)) for shapes, c in groups]
-            return at, *(np.concatenate([p[k][mine] for p in pairs], axis=1) for k in range(2))
+            left, spread = (np.concatenate([p[k][mine] for p in pairs], axis=1) for k in range(2))
+            return at, left, spread
 
         residuals, variance = np.full((2, len(self.data), 3), np.nan)
         for at, difference, spread in map_on_threads(job, self._cells(places), threads):

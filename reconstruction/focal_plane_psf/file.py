@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,6 +23,8 @@ from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...wavefront.aberration import ResidualWavefront
 from ...wavefront.atmosphere.atmosphere import Atmosphere
+from ...wavefront.atmosphere.moment_covariance import ExposedAir
+from ...wavefront.atmosphere.polar_lags import PolarLags
 from ...wavefront.psf.light import Light
 from ...wavefront.psf.stamps import Stamps
 from .covariance import Covariance, Places
@@ -30,6 +32,7 @@ from .field import ShapeField
 from .fit import ShapeData
 from .heights import HeightPrior
 from .images import ResidualImages
+from .layer_covariance import LayerCovariance
 from .mosaic import Mosaic, PsfShapes
 from .optics_part import OpticsPart
 from .response import ExposureResponse, Instrument
@@ -92,7 +95,7 @@ def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
         _image_hdu("SHAPE", data.values),
         _image_hdu("NOISE", data.noise),
         _image_hdu("RESIDUAL", field.residuals),
-        _image_hdu("COVARIANCE", np.stack([_covariance_row(c) for c in field.covariances])),
+        *_covariance_hdus(field.covariances),
         _image_hdu("USED", model.used.astype(np.int16)),
         _image_hdu("LEFT_OUT", np.stack([predicted.e1, predicted.e2, predicted.size], axis=1)),
     ]
@@ -193,7 +196,7 @@ def read_model(kind: type[_Model], hdus: Iterable[fits.ImageHDU], path: Path) ->
                 mosaic,
                 ShapeData(places, part("SHAPE"), part("NOISE")),
                 part("RESIDUAL"),
-                tuple(_covariance_from_row(row) for row in part("COVARIANCE")),
+                _covariances_of(part, extensions),
                 optics,
                 part("DESIGN") if optics is not None else None,
             ),
@@ -254,6 +257,42 @@ def _telescope_from_text(text: str) -> Telescope:
 
 def _places_of(mosaic: Mosaic, xy: np.ndarray, ccd: np.ndarray) -> Places:
     return mosaic.at(xy, ccd.astype(np.int64))
+
+
+def _covariance_hdus(covariances: Sequence[Covariance | LayerCovariance]) -> list[fits.ImageHDU]:
+    """Return the covariances of the shapes: a row of each, or layers and a table of all three."""
+    layered = covariances[0]
+    if not isinstance(layered, LayerCovariance):
+        rows = [_covariance_row(c) for c in covariances if isinstance(c, Covariance)]
+        return [_image_hdu("COVARIANCE", np.stack(rows))]
+    air = layered.air
+    layers = np.column_stack([air.altitudes, air.weights, air.velocities])
+    numbers = [air.exposure, air.r0, air.outer_scale, air.cutoff, air.diameter, air.obscuration]
+    return [
+        _image_hdu("LAYERS", layers, "altitude [m], weight, wind along x and y of the sky [m/s]"),
+        _image_hdu("AIR", np.array(numbers), "exposure [s], r0 [m], L0 [m], cut-off [rad/m], pupil [m], obscuration"),
+        _image_hdu("LAYER_COVARIANCE", layered.table, "of e1, e2, ln size: 11, 22, 33, 12, 13, 23"),
+        _image_hdu("LAGS", np.array([layered.lags.unit, layered.lags.step]), "first scale [rad] and step of rings"),
+        _image_hdu("TO_SKY", layered.to_sky, "[1/m] field slopes by positions on the detector"),
+        _image_hdu("STAR_VARIANCE", np.stack([layered.constant, layered.nugget]), "common to all, and of each"),
+    ]
+
+
+def _covariances_of(
+    part: Callable[[str], np.ndarray], names: Container[str]
+) -> tuple[Covariance | LayerCovariance, ...]:
+    if "LAYERS" not in names:
+        return tuple(_covariance_from_row(row) for row in part("COVARIANCE"))
+    layers, table = part("LAYERS"), part("LAYER_COVARIANCE")
+    air = ExposedAir(
+        tuple(layers[:, 0].tolist()),
+        tuple(layers[:, 1].tolist()),
+        tuple((x, y) for x, y in layers[:, 2:].tolist()),
+        *part("AIR").tolist(),
+    )
+    unit, step = part("LAGS").tolist()
+    lags = PolarLags(unit, step, *table.shape[:2])
+    return (LayerCovariance(air, part("TO_SKY"), lags, table, *part("STAR_VARIANCE")),)
 
 
 def _covariance_row(covariance: Covariance) -> np.ndarray:

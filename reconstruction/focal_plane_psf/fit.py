@@ -13,6 +13,7 @@ uncertain parameters marginalised.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -165,7 +166,7 @@ class ExposureFit:
         self.heights = np.zeros(prior.n_parameter)
         self.exposure = np.zeros(N_EXPOSURE)
         self._center = float(np.mean(prior.heights(self.heights, data.places)))
-        self.covariances: list[Covariance] | list[LayerCovariance] = []
+        self.covariances: Sequence[Covariance | LayerCovariance] = []
         self.at_bounds: tuple[str, ...] = ()
         self.covariance: np.ndarray | None = None
         self._log_determinant = 0.0

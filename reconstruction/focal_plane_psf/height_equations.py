@@ -51,7 +51,12 @@ class HeightEquations(NamedTuple):
         root = scipy.linalg.cholesky(exposure_matrix * scale[:, None] * scale, lower=True)
         factor = scipy.linalg.solve_triangular(root, (cross * scale).T, lower=True).T
         vector -= factor @ scipy.linalg.solve_triangular(root, scale * right, lower=True)
-        return cls(heights, factor, vector, ExposureState(fit.exposure, fit.covariances))
+        return cls(
+            heights,
+            factor,
+            vector,
+            ExposureState(fit.exposure, [c for c in fit.covariances if isinstance(c, Covariance)]),
+        )
 
     def add_to(self, matrix: np.ndarray, vector: np.ndarray) -> None:
         """Add to the normal equations of all exposures."""

@@ -20,6 +20,10 @@ from ...wavefront.atmosphere.moment_covariance import PAIRS, ExposedAir
 from ...wavefront.atmosphere.polar_lags import PolarLags
 from .covariance import Covariance, Places
 
+# Part of the variances that is added where a matrix is indefinite, doubled at each attempt.
+_MORE = 1e-3
+_ATTEMPTS = 12
+
 
 @dataclass(frozen=True, eq=False)
 class LayerCovariance:
@@ -75,11 +79,27 @@ class LayerCovariance:
         """Return the lower Cholesky factor of the covariance of stars, nugget and noise variances [3 n] included."""
         matrix = self.between(places, places)
         matrix[np.diag_indices(len(matrix))] += noise + np.repeat(self.nugget, len(places))
-        return scipy.linalg.cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
+        return root_of(matrix)
 
     def at(self, places: Places) -> np.ndarray:
         """Return the variance at places, shape [3 n]."""
         return np.repeat(self.constant + self.variance, len(places))
+
+
+def root_of(matrix: np.ndarray) -> np.ndarray:
+    """Return the lower Cholesky factor of a covariance matrix [n, n], of one a little larger where it has none.
+
+    Errors of interpolation between lags can make it indefinite where stars have next to no noise.
+    """
+    for k in range(_ATTEMPTS):
+        with_more = matrix.copy()
+        if k:
+            with_more[np.diag_indices(len(matrix))] *= 1.0 + _MORE * 2.0**k
+        try:
+            return scipy.linalg.cholesky(with_more, lower=True, overwrite_a=True, check_finite=False)
+        except scipy.linalg.LinAlgError:
+            continue
+    return scipy.linalg.cholesky(np.diag(np.diagonal(matrix)), lower=True)
 
 
 def in_blocks(values: np.ndarray, constant: np.ndarray) -> np.ndarray:
@@ -96,7 +116,7 @@ def in_blocks(values: np.ndarray, constant: np.ndarray) -> np.ndarray:
 
 
 def shape_groups(
-    covariances: Sequence[Covariance] | Sequence[LayerCovariance],
+    covariances: Sequence[Covariance | LayerCovariance],
 ) -> list[tuple[slice, Covariance | LayerCovariance]]:
     """Return the shapes that covary, and their covariance: each shape by itself, or all three."""
     if isinstance(covariances[0], LayerCovariance):

@@ -23,7 +23,6 @@ from ...core.random_streams import stream
 from ...models.camera.camera import Camera
 from ...wavefront.atmosphere.mean_wavefront import covariance_by_wavefront
 from ...wavefront.atmosphere.moment_covariance import (
-    FINE,
     PAIRS,
     ExposedAir,
     MomentResponse,
@@ -35,32 +34,35 @@ from ...wavefront.atmosphere.polar_lags import PolarLags
 from ..gaussian_field import inverse_from_cholesky
 from .covariance import Places
 from .kriging import map_on_threads
-from .layer_covariance import LayerCovariance, in_blocks, in_order
+from .layer_covariance import LayerCovariance, in_blocks, in_order, root_of
 from .likelihood import blocks_of
 from .response import NOLL
 
 # Stars of a block of the likelihood, and most blocks: the strengths of layers are common to all.
 _BLOCK = 120
 _MOST_BLOCKS = 64
-# Sampling of the theory while winds are searched: covariances are right within a few per cent.
-_RINGS = 12
-_SPOKES = 12
+# Rings and spokes of the theory, and sampling, while winds are searched: covariances are right within 2 %.
+_SEARCH = (12, 16)
 _COARSE = MomentSampling(near_spacing=1.4, drift=2.8, near_drift=1.0, least_delays=32)
+# The same of results: within 0.3 %.
+_RESULT = (28, 36)
+_FINE = MomentSampling(0.7, 0.35, 0.7, 0.25)
 # Wind that it is chosen for, over the fastest of the prior.
 _FASTEST = 1.3
 # Directions of all winds that are tried first.
 _DIRECTIONS = 64
-# Standard deviations of the priors: logarithms of speeds, strengths, Fried parameter, outer scale and nuggets.
+# Standard deviations of the priors: logarithms of speeds, strengths, Fried parameter, which the mean size of the stars
+# gives, outer scale and nuggets.
 _SPEED = 0.3
 _STRENGTH = 0.3
-_FRIED = 0.2
+_FRIED = 0.05
 _OUTER_SCALE = 0.3
 _NUGGET = 2.0
 # Unit of the components of winds [m/s], and least speed of a prior.
 _WIND = 10.0
 _LEAST_SPEED = 0.5
 # Step of the differences.
-_STEP = 0.02
+_STEP = 0.01
 # Nugget over the variance: least, at the start, and most.
 _NUGGETS = (0.005, 0.02, 1.0)
 # Most steps of the search, and of one from a solution.
@@ -118,8 +120,10 @@ class LayerTheory:
         """Return the covariance function of an exposure."""
         camera = self.camera
         side = float(np.max(camera.half_sizes))
-        polar = PolarLags.of(air, self.reach(2.0 * (float(np.hypot(*camera.centers.T).max()) + math.sqrt(2.0) * side)))
-        values = self.by_moments(air, polar.lags, FINE) + self.by_wavefront(air, polar.lags)
+        reach = self.reach(2.0 * (float(np.hypot(*camera.centers.T).max()) + math.sqrt(2.0) * side))
+        polar, smooth = PolarLags.of(air, reach, *_RESULT), PolarLags.of(air, reach)
+        values = self.by_moments(air, polar.lags, _FINE)
+        values += interpolation(smooth, polar.lags) @ self.by_wavefront(air, smooth.lags)
         return LayerCovariance(air, self.to_sky, polar, polar.table(values), constant, nugget)
 
 
@@ -147,15 +151,15 @@ class LayerFit:
         #: Stars of each block of the likelihood.
         self.blocks = [blocks[k] for k in chosen]
         extent = max(float(np.hypot(*np.ptp(places.xy[block], axis=0))) for block in self.blocks)
-        self._lags = PolarLags.of(prior, theory.reach(extent), _RINGS, _SPOKES)
+        self._lags = PolarLags.of(prior, theory.reach(extent), *_SEARCH)
         to_sky = theory.to_sky.T
         self._weights = [
-            _interpolation(self._lags, ((places.xy[b][:, None] - places.xy[b]) @ to_sky).reshape(-1, 2))
+            interpolation(self._lags, ((places.xy[b][:, None] - places.xy[b]) @ to_sky).reshape(-1, 2))
             for b in self.blocks
         ]
         self._data: list[_BlockData] = []
         self._by_wavefront = np.zeros((len(self._lags.lags), len(PAIRS)))
-        self._variance = theory.by_moments(prior, np.zeros((1, 2)), FINE)[0, :3]
+        self._variance = theory.by_moments(prior, np.zeros((1, 2)), _FINE)[0, :3]
 
     def observe(
         self, values: np.ndarray, noise: np.ndarray, spread: Callable[[np.ndarray], np.ndarray] | None = None
@@ -253,13 +257,13 @@ class LayerFit:
         """Return minus the logarithm of the likelihood times the priors, and its gradient."""
         n = len(self._speeds)
         nugget = self._nugget(parameters)
-        value, by_table, by_nugget = self._likelihood(self._table(parameters), nugget)
+        table = self._table(parameters)
+        value, by_table, by_nugget = self._likelihood(table, nugget)
         gradient = np.empty_like(parameters)
         for k in range(len(parameters) - 3):
             step = np.zeros_like(parameters)
             step[k] = _STEP
-            change = self._table(parameters + step) - self._table(parameters - step)
-            gradient[k] = float((change * by_table).sum()) / (2.0 * _STEP)
+            gradient[k] = float(((self._table(parameters + step) - table) * by_table).sum()) / _STEP
         gradient[-3:] = by_nugget * nugget
         winds = _WIND * parameters[: 2 * n].reshape(n, 2)
         speed = np.maximum(np.hypot(*winds.T), 1e-3)
@@ -280,7 +284,7 @@ class LayerFit:
             data, weights, m = self._data[k], self._weights[k], len(self.blocks[k])
             matrix = in_blocks((weights @ table).T.reshape(-1, m, m), self._constant)
             matrix[np.diag_indices(3 * m)] += data.noise + np.repeat(nugget, m)
-            root = scipy.linalg.cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
+            root = root_of(matrix)
             white = scipy.linalg.solve_triangular(root, data.factor, lower=True, check_finite=False)
             value = -0.5 * float((white**2).sum()) - float(np.log(np.diagonal(root)).sum())
             if not gradient:
@@ -295,7 +299,8 @@ class LayerFit:
             return value, weights.T @ np.stack(by_pair, axis=1), by_nugget
 
         parts = map_on_threads(contribution, range(len(self.blocks)), self._theory.threads)
-        return sum(p[0] for p in parts), sum(p[1] for p in parts), sum(p[2] for p in parts)
+        values, by_table, by_nugget = zip(*parts, strict=True)
+        return float(sum(values)), np.sum(by_table, axis=0), np.sum(by_nugget, axis=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,7 +325,7 @@ def _turn(jacobian: np.ndarray) -> np.ndarray:
     return out
 
 
-def _interpolation(lags: PolarLags, places: np.ndarray) -> scipy.sparse.csr_matrix:
+def interpolation(lags: PolarLags, places: np.ndarray) -> scipy.sparse.csr_matrix:
     """Return weights of the values at lags in those at places [n, 2] [rad]: Lagrange's cubics in ring and spoke."""
     ring = np.log1p(np.hypot(*places.T) / lags.unit) / lags.step
     spoke = np.arctan2(places[:, 1], places[:, 0]) / np.pi * lags.spokes

@@ -231,7 +231,7 @@ class FocalPlanePsf(ModelFields, Result):
         return self.field.mosaic
 
     @property
-    def covariances(self) -> tuple[Covariance, ...] | tuple[LayerCovariance, ...]:
+    def covariances(self) -> tuple[Covariance | LayerCovariance, ...]:
         """Covariances of what turbulence adds to e1, e2 and ln size: of each, or one of all with the layers found."""
         return self.field.covariances
 

@@ -279,6 +279,21 @@ class _Delays:
         fastest = sampling.wind
         if fastest is None:
             fastest = max((math.hypot(x, y) for x, y in air.velocities), default=0.0)
+        # They depend on nothing else of the air.
+        return cls._chosen(
+            air._replace(altitudes=(), weights=(), velocities=(), r0=0.0, outer_scale=0.0, cutoff=0.0),
+            aberration,
+            lit,
+            sampling._replace(wind=fastest),
+        )
+
+    @classmethod
+    @lru_cache(maxsize=4)
+    def _chosen(
+        cls, air: ExposedAir, aberration: tuple[float, ...], lit: tuple[float, ...], sampling: MomentSampling
+    ) -> Self:
+        fastest = sampling.wind
+        assert fastest is not None
         near = min(_NEAR / max(fastest, 1e-9), 0.5 * air.exposure)
         near_drift, drift = min(sampling.near_drift, air.diameter / 16.0), min(sampling.drift, air.diameter / 4.0)
         near_count = max(sampling.least_delays // 2, math.ceil(near * fastest / near_drift))

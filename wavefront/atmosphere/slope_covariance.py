@@ -12,7 +12,7 @@ with :math:`k = 2 \pi \nu` and the direction :math:`\phi` from one point to the 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -33,8 +33,8 @@ _LONGEST = 250.0
 #: Covariance over the variance that counts as none. Fourth powers of far less would be denormal, which takes processors
 #: ten times as long.
 _NEGLIGIBLE = 1e-3
-#: Frequencies of the integrals, at least, and a radian of the longest table.
-_LEAST_NODES = 512
+#: Frequencies of the integrals: a multiple of the first, and so many a cycle of the longest table.
+_NODES = 512
 _NODES_PER_CYCLE = 6.0
 # Distances whose integrals are taken at a time, which bounds the memory.
 _BATCH = 256
@@ -61,16 +61,22 @@ def slope_covariance(r0: float, outer_scale: float, cutoff: float) -> SlopeCovar
     ``r0`` and ``outer_scale`` [m] are as those of an atmosphere. The slopes are those of the low screens, taken over
     :data:`SLOPE_LAG`.
     """
+    table, scale = _of_one_metre(outer_scale, cutoff), r0 ** (-5.0 / 3.0)
+    return replace(table, isotropic=scale * table.isotropic, directed=scale * table.directed)
+
+
+@lru_cache(maxsize=16)
+def _of_one_metre(outer_scale: float, cutoff: float) -> SlopeCovariance:
+    """Return that of a Fried parameter of 1 m."""
     reach = min(_REACH * outer_scale, _LONGEST)
     distance = _COARSE_STEP * np.arange(math.ceil(reach / _COARSE_STEP) + 1)
     highest = cutoff / (2.0 * math.pi)
-    count = max(_LEAST_NODES, math.ceil(_NODES_PER_CYCLE * highest * reach))
-    node, weight = np.polynomial.legendre.leggauss(count)
+    node, weight = _nodes(_NODES * max(1, math.ceil(_NODES_PER_CYCLE * highest * reach / _NODES)))
     # The square root spreads the knee of the spectrum at 1/L0 over many nodes.
     root = 0.5 * (node + 1.0)
     nu = highest * root**2
     k = 2.0 * math.pi * nu
-    power = path_spectrum(nu, r0, outer_scale) * (k * np.sinc(nu * SLOPE_LAG)) ** 2
+    power = path_spectrum(nu, 1.0, outer_scale) * (k * np.sinc(nu * SLOPE_LAG)) ** 2
     power *= 2.0 * math.pi * nu * (highest * root * weight)
     isotropic, directed = np.empty(len(distance)), np.empty(len(distance))
     for first in range(0, len(distance), _BATCH):
@@ -90,3 +96,9 @@ def slope_covariance(r0: float, outer_scale: float, cutoff: float) -> SlopeCovar
     # A zero ends the tables.
     same[end:], other[end:] = 0.0, 0.0
     return SlopeCovariance(_STEP, same[: end + 1], other[: end + 1])
+
+
+@lru_cache(maxsize=8)
+def _nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return so many nodes and weights of Gauss and Legendre; eigenvalues, which take longer than the integrals."""
+    return np.polynomial.legendre.leggauss(count)

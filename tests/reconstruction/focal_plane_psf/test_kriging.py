@@ -59,9 +59,9 @@ def test_leave_one_out_is_a_fit_without_each_star():
         k = COVARIANCE.between(STARS[others], STARS[i : i + 1])[:, 0]
         weights = np.linalg.solve(total(STARS[others], NOISE[others]), k)
         # Rounding at a condition of 1e5; the variance of the difference holds the noise of the star itself.
-        assert left[i] == pytest.approx(VALUES[i] - weights @ VALUES[others], abs=1e-9)
+        assert left[i, 0] == pytest.approx(VALUES[i] - weights @ VALUES[others], abs=1e-9)
         own = COVARIANCE.at(STARS[i : i + 1])[0] + NOISE[i] + COVARIANCE.nugget
-        assert variance[i] == pytest.approx(own - weights @ k, abs=1e-9)
+        assert variance[i, 0] == pytest.approx(own - weights @ k, abs=1e-9)
 
 
 def test_the_mean_is_free():
@@ -88,7 +88,7 @@ def test_no_byte_depends_on_the_threads():
     def job(stars):
         near = neighbourhood(COVARIANCE, STARS, VALUES, NOISE, stars)
         k = COVARIANCE.between(STARS[stars], ELSEWHERE)
-        return np.concatenate([near.predict(k), near.weights(k).ravel(), *leave_one_out(near)])
+        return np.concatenate([near.predict(k), near.weights(k).ravel(), *(v.ravel() for v in leave_one_out(near))])
 
     one, two = (np.concatenate(map_on_threads(job, groups, threads)) for threads in (1, 2))
     assert one.tobytes() == two.tobytes()

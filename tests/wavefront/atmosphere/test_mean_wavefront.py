@@ -8,7 +8,8 @@ import pytest
 from pachon.core.errors import DomainError
 from pachon.models.zernike_polynomials import annular_zernikes
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
-from pachon.wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
+from pachon.wavefront.atmosphere.mean_wavefront import covariance_by_wavefront, mean_wavefront_covariance
+from pachon.wavefront.atmosphere.moment_covariance import ExposedAir
 from pachon.wavefront.atmosphere.turbulence import path_spectrum
 
 NOLL = np.arange(4, 23)
@@ -97,3 +98,16 @@ def test_frozen_screens_drawn_and_averaged_have_these_variances():
 def test_tilts_are_refused():
     with pytest.raises(DomainError, match=r"noll = \[3\]: expected Noll indices from 4"):
         mean_wavefront_covariance(air(), [(0.0, 0.0)], [3], DIAMETER, OBSCURATION)
+
+
+def test_what_is_linear_in_the_wavefront_covaries_as_its_zernikes():
+    exposed = ExposedAir.of(air(), DIAMETER, OBSCURATION)
+    above = exposed._replace(**{key: getattr(exposed, key)[1:] for key in ("altitudes", "weights", "velocities")})
+    rng = np.random.default_rng(0)
+    products, lags = rng.standard_normal((2, 8, 8)), rng.uniform(-3e-3, 3e-3, (3, 2))
+    found = covariance_by_wavefront(exposed, lags, range(4, 12), products)
+    for lag, values in zip(lags, found, strict=True):
+        pair = mean_wavefront_covariance(above, [lag, (0.0, 0.0)], range(4, 12), DIAMETER, OBSCURATION)[0, :, 1]
+        np.testing.assert_allclose(values, np.einsum("pab,ab->p", products, 0.5 * (pair + pair.T)), rtol=1e-9)
+    # All stars share the layer on the ground; beyond five outer scales nothing else.
+    assert not covariance_by_wavefront(exposed, np.array([[0.2, 0.0]]), [4], np.ones((1, 1, 1))).any()
