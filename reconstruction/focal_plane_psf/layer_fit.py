@@ -61,10 +61,13 @@ _NUGGET = 2.0
 # Unit of the components of winds [m/s], and least speed of a prior.
 _WIND = 10.0
 _LEAST_SPEED = 0.5
-# Step of the differences.
+# Steps of the differences: of winds, over less of which the sums over baselines are not smooth, and of logarithms.
+_WIND_STEP = 0.05
 _STEP = 0.01
 # Nugget over the variance: least, at the start, and most.
 _NUGGETS = (0.005, 0.02, 1.0)
+# Gain of the likelihood that ends the search, a tenth of what matters, over its size for each value of a star.
+_GAIN = 0.05
 # Most steps of the search, and of one from a solution.
 _ITERATIONS = 15
 _AGAIN = 4
@@ -214,6 +217,7 @@ class LayerFit:
                 advance(1)
             return self._negative_log_posterior(parameters)
 
+        count = 3 * sum(len(block) for block in self.blocks)
         bounds: list[tuple[float | None, float | None]] = [(None, None)] * (len(start) - 3)
         low, _, high = np.log(_NUGGETS)
         optimum = minimize(
@@ -222,7 +226,7 @@ class LayerFit:
             jac=True,
             method="L-BFGS-B",
             bounds=[*bounds, *[(low, high)] * 3],
-            options={"maxiter": steps, "maxfun": 2 * steps, "ftol": 1e-6},
+            options={"maxiter": steps, "maxfun": 2 * steps, "ftol": _GAIN / count},
         )
         return self._theory.covariance(self._air(optimum.x), self._constant, self._nugget(optimum.x))
 
@@ -262,8 +266,8 @@ class LayerFit:
         gradient = np.empty_like(parameters)
         for k in range(len(parameters) - 3):
             step = np.zeros_like(parameters)
-            step[k] = _STEP
-            gradient[k] = float(((self._table(parameters + step) - table) * by_table).sum()) / _STEP
+            step[k] = _WIND_STEP if k < 2 * n else _STEP
+            gradient[k] = float(((self._table(parameters + step) - table) * by_table).sum()) / step[k]
         gradient[-3:] = by_nugget * nugget
         winds = _WIND * parameters[: 2 * n].reshape(n, 2)
         speed = np.maximum(np.hypot(*winds.T), 1e-3)

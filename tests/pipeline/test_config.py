@@ -249,7 +249,7 @@ def test_silicon_is_off_by_default_and_then_no_part_of_the_hash():
     content["stars"] = hashed_stars(content["stars"])
     assert list(content["stars"]) == ["truth", "observed", "snr_min", "neighbours", "cosmic_rays", "saturated"]
     content["focal_plane"] = hashed_heights(content["focal_plane"])
-    del content["active_optics"]["states"]
+    del content["active_optics"]["states"], content["reconstruction"]["turbulence"]
     assert thin.config_hash == plain.config_hash == digest(content)
     options = {"detector__silicon": True, "detector__thickness_um": 80.0, "detector__temperature_k": 180.0, **SMALL}
     silicon = Experiment.from_config(with_options(Configuration(), **options))

@@ -375,6 +375,12 @@ def test_optics_alone_are_refused(focal_plane_config):
         focal_plane_config(atmosphere__enabled=False, psf__engine="fast")
 
 
+def test_layers_are_of_the_focal_plane_model_alone(focal_plane_config):
+    assert focal_plane_config(reconstruction__turbulence="layers").reconstruction.turbulence == "layers"
+    with pytest.raises(ConfigError, match=r"^reconstruction.turbulence = layers: expected model = focal_plane[^\n]*$"):
+        focal_plane_config(reconstruction__turbulence="layers", reconstruction__model="ccd")
+
+
 @pytest.mark.long
 def test_too_few_stars_are_one_line(focal_plane_config, tmp_path, capsys):
     path = tmp_path / "small.yaml"

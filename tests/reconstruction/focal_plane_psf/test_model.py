@@ -15,6 +15,7 @@ from pachon.models.camera.silicon import Silicon
 from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf, _fit_warnings
 from pachon.reconstruction.focal_plane_psf.optics_prior import OpticsPrior
 from pachon.reconstruction.focal_plane_psf.response import Instrument
+from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 
 UM = 1e-6
 PLANTED = "R23_S11"
@@ -220,8 +221,53 @@ def test_no_evidence_depends_on_the_threads_of_blas(of_two_threads_of_blas, alig
     assert of_two_threads_of_blas.evidence == aligned.evidence
 
 
+@pytest.fixture(scope="module")
+def layered(exposure, few, lsst_r, wavelengths):
+    """Turbulence by the theory of two layers, whose winds are about known."""
+    whole = Atmosphere.from_site("cerro_pachon", 0)
+    two = {key: getattr(whole, key)[:2] for key in ("altitudes", "weights", "velocities", "offsets")}
+    instrument = Instrument.of(lsst_r, wavelengths, replace(whole, **two))
+    stars = exposure.stars(few)
+    return FocalPlanePsf.fit(stars, instrument, exposure.plane, prior=ALIGNED, turbulence="forecast", threads=1)
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("which", ["aligned", "blind"])
+def test_layers_predict_about_as_well_as_exponentials(layered, exposure, few, lsst_r, wavelengths):
+    # The field is drawn of exponentials: the theory is not better here, but it predicts, with an uncertainty.
+    instrument = Instrument.of(lsst_r, wavelengths)
+    by_exponentials = FocalPlanePsf.fit(exposure.stars(few), instrument, exposure.plane, prior=ALIGNED, threads=1)
+    errors = [rms(at_holdout(m, exposure)[0]).mean() for m in (layered, by_exponentials)]
+    assert errors[0] < 1.15 * errors[1]
+    (covariance,) = layered.covariances
+    assert np.shape(covariance.air.velocities) == (2, 2)
+    assert np.isfinite(values(layered.leave_one_out)[layered.used]).all()
+
+
+def test_layers_need_a_telescope(exposure):
+    with pytest.raises(DomainError, match=r"^turbulence = 'layers': expected a telescope[^\n]*$"):
+        FocalPlanePsf.fit(exposure.stars(), camera=exposure.camera, turbulence="layers")
+
+
+@pytest.mark.long
+def test_ccds_of_many_stars_are_predicted_in_parts(blind, exposure, monkeypatch):
+    # Of fifteen neighbours those about each quarter of a CCD, not its middle.
+    monkeypatch.setattr("pachon.reconstruction.focal_plane_psf.field.NEIGHBOURS", 15)
+    residuals, variance = blind.field.leave_one_out_residuals()
+    assert np.isfinite(residuals).all()
+    assert (variance > 0.0).all()
+    own = exposure.camera.ccd_index(PLANTED)
+    corner = exposure.camera.centers[own] + 0.8 * 0.5 * exposure.camera.shortest_side
+    found = blind.field.predict(blind.field.mosaic.places(PLANTED, *corner))[0]
+    monkeypatch.undo()
+    by_all = blind.field.predict(blind.field.mosaic.places(PLANTED, *corner))[0]
+    assert found == pytest.approx(by_all, abs=3e-3)
+    middle = blind.field.mosaic.places(PLANTED, *exposure.camera.centers[own])
+    cells = blind.field._cells(middle)
+    np.testing.assert_array_equal(cells[0][0], exposure.camera.centers[own])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("which", ["aligned", "blind", "layered"])
 def test_a_written_model_is_the_same(which, tmp_path, request):
     model = request.getfixturevalue(which)
     path = tmp_path / "model.fits"
