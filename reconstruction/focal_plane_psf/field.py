@@ -81,8 +81,8 @@ class ShapeField:
                 change[:, shapes] = near.predict(between).reshape(-1, len(at)).T
                 if variance:
                     weights = near.weights(between)
-                    left = covariance.at(places[at]) - (between * weights).sum(axis=0)
-                    spread[:, shapes] = left.reshape(-1, len(at)).T
+                    unexplained = covariance.at(places[at]) - (between * weights).sum(axis=0)
+                    spread[:, shapes] = unexplained.reshape(-1, len(at)).T
                     if design is not None:
                         ccd = int(places.ccd[at[0]])
                         spread[:, shapes] += self._optics_variance(ccd, shapes, design[at], stars, weights)
@@ -101,17 +101,17 @@ class ShapeField:
 
     def _cells(self, places: Places) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the middle [m] of each CCD, or of each of its parts where it has many stars, and the places there."""
-        most, cells = self._neighbour_count // 2, []
+        stars_of_cell, cells = self._neighbour_count // 2, []
         for ccd in np.unique(places.ccd):
             at = np.flatnonzero(places.ccd == ccd)
-            count = math.ceil(math.sqrt(np.count_nonzero(self.data.places.ccd == ccd) / most))
+            count = math.ceil(math.sqrt(np.count_nonzero(self.data.places.ccd == ccd) / stars_of_cell))
             if count <= 1:
                 cells.append((self.mosaic.centers[ccd], at))
                 continue
-            part = np.clip(np.floor(0.5 * count * (places.uv[at] + 1.0)).astype(int), 0, count - 1)
-            for number in np.unique(part[:, 0] * count + part[:, 1]):
+            column, row = np.clip(np.floor(0.5 * count * (places.uv[at] + 1.0)).astype(int), 0, count - 1).T
+            for number in np.unique(column * count + row):
                 middle = (2.0 * np.array(divmod(int(number), count)) + 1.0) / count - 1.0
-                cells.append((self.mosaic.from_uv(ccd, middle), at[part[:, 0] * count + part[:, 1] == number]))
+                cells.append((self.mosaic.from_uv(ccd, middle), at[column * count + row == number]))
         return cells
 
     def _neighbourhood(
@@ -155,11 +155,11 @@ class ShapeField:
         def job(cell: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             center, at = cell
             stars = np.union1d(neighbours_of(places, center, self._neighbour_count), at)
-            mine = np.searchsorted(stars, at)
+            rows = np.searchsorted(stars, at)
             groups = shape_groups(self.covariances)
             pairs = [leave_one_out(self._neighbourhood(c, stars, shapes)) for shapes, c in groups]
-            left, spread = (np.concatenate([p[k][mine] for p in pairs], axis=1) for k in range(2))
-            return at, left, spread
+            difference, spread = (np.concatenate([p[k][rows] for p in pairs], axis=1) for k in range(2))
+            return at, difference, spread
 
         residuals, variance = np.full((2, len(self.data), 3), np.nan)
         for at, difference, spread in map_on_threads(job, self._cells(places), threads):

