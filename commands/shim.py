@@ -12,7 +12,7 @@ from ..core.number_text import NumberText
 from ..core.terminal import print_line
 from . import completion
 from .choices import choice, names
-from .inputs import configured_experiment
+from .inputs import configuration, configured_experiment
 from .interrupt import interruptible
 from .options import Ccds, Config, Json, Quiet, Raft, Settings, TableFile, Threads, one_name_list
 from .tables import Rows, print_json, write_rows
@@ -61,8 +61,8 @@ def shim_command(
 ) -> None:
     """Find by how much rafts or CCDs should move for the sharpest, roundest or least correlated images.
 
-    Telescope, band, heights and seeing are those of the configuration; all CCDs are used unless some are named. Motions
-    (shims.ecsv), gains (shims.json), a plot, and the configuration with the shims go into one folder.
+    Telescope, band, heights and seeing are those of the configuration; all CCDs are used unless it or an option names
+    some. Motions (shims.ecsv), gains (shims.json), a plot, and the configuration with the shims go into one folder.
 
     **Examples**
 
@@ -75,7 +75,7 @@ def shim_command(
     from ..studies.shimming.product import shim_metrics, write_shims
     from ..studies.shimming.shim import shim
 
-    ccd_names = one_name_list(ccds=ccds, raft=raft) or ("all",)
+    ccd_names = one_name_list(ccds=ccds, raft=raft) or configuration(config, settings).ccds or ("all",)
     experiment = configured_experiment(
         config, settings, ccds=ccd_names, focal_plane__heights=heights, psf__engine="long_exposure"
     )

@@ -12,7 +12,7 @@ from typer import Option
 from ..core.errors import ConfigError
 from ..core.number_text import NumberText
 from ..core.terminal import print_line
-from .inputs import configured_experiment
+from .inputs import configuration, configured_experiment
 from .interrupt import interruptible
 from .options import Config, Json, Quiet, Settings, TableFile, Threads, TruthStars, ccd_list, name_list, one_name_list
 from .tables import Rows, print_json, wide_console, write_rows
@@ -81,7 +81,9 @@ def study_command(
     from ..studies.psf_choice.product import study_summary, write_study
     from ..studies.psf_choice.study import STUDY_CCDS, study, study_experiment
 
-    ccd_names = STUDY_CCDS if config is None and ccds is None else one_name_list(ccds=ccds)
+    ccd_names = one_name_list(ccds=ccds) or configuration(config, settings).ccds
+    if config is None:
+        ccd_names = ccd_names or STUDY_CCDS
     model = "focal_plane" if focal_plane else None
     # Around polynomials, which have the order, components and weights to study.
     resolved = configured_experiment(

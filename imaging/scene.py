@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -50,6 +51,7 @@ class CcdScene:
     seed: int
     epoch: int
     cards: tuple[Card, ...] = ()  #: of instrument and time
+    lit_fraction: float = 1.0  #: of the pupil in the middle, over that on the axis
 
     @check_arguments
     def exposed(self, exposure: Exposure | None = None, *, threads: int | None = None) -> CcdImage:
@@ -59,6 +61,7 @@ class CcdScene:
         scene = self.electrons if ratio == 1.0 else (self.electrons * ratio).astype(np.float32)
         ccd_image = expose(scene, settings, self.seed, self.name, self.epoch, threads=threads)
         header = self.wcs.to_header((self.window.x, self.window.y))
+        zero_point = settings.zero_point + 2.5 * math.log10(self.lit_fraction)
         for key, value, comment in (
             ("BUNIT", "adu", ""),
             ("TELESCOP", card_text(self.telescope), "prescription"),
@@ -66,7 +69,7 @@ class CcdScene:
             ("EXPTIME", settings.total_time, "[s] all exposures together"),
             ("NEXP", settings.exposures, "number of exposures"),
             ("GAIN", settings.gain, "[electron/adu]"),
-            ("ZEROPNT", round(settings.zero_point, 6), "[mag] AB magnitude of 1 adu in EXPTIME"),
+            ("ZEROPNT", round(zero_point, 6), "[mag] AB, of 1 adu in EXPTIME, in the middle"),
             ("SKY", round(settings.background / settings.gain, 6), "[adu] background: sky and dark current"),
             ("SKYSUB", settings.subtract_background, "whether the background is subtracted"),
             ("RDNOISE", settings.read_noise, "[electron] rms of one exposure"),
@@ -177,6 +180,7 @@ def draw_ccd(
         progress=progress,
     )
     stars = _add_stars(image, experiment, ccd, psf, exposure, area, threads, progress)
+    middle = np.array([[area.x, area.y]]) + 0.5 * (np.array([area.width, area.height]) - 1.0)
     tables = [
         {
             "PIXEL": stars["PIXEL"],
@@ -207,6 +211,8 @@ def draw_ccd(
         config.seed,
         config.atmosphere.epoch,
         tuple(observation_cards(experiment, ccd, exposure.total_time)),
+        # Where no light is in the middle, the zero point is that of the axis.
+        lit_fraction=float(psf.lit_fraction(middle)[0]) or 1.0,
     )
 
 

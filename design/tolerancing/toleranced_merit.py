@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from ...core.errors import DomainError, PachonError
 from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...models.parameters.parameters import Parameter, apply
-from ...models.parameters.tolerances import Tolerance
+from ...models.parameters.tolerances import Tolerance, draw
 from ...models.telescope import Telescope
 from ..optimize.jacobian import ParameterColumns
 from ..optimize.optimize import NO_EFFECT
@@ -20,6 +20,13 @@ from .criterion import Criterion
 _STEP = 0.5
 #: Relative curvature along combinations of compensators below which they have no effect.
 _FLAT = 1e-9
+#: Relative size of effects of combinations of compensators that depend on each other but for rounding.
+_DEPENDENT = 1e-9
+#: Drawn telescopes whose derivatives say how far those of the telescope as designed hold, and the seed of the draw.
+_DRAWS = 4
+_SEED = 0
+#: Halvings of the moves of compensators that leave a drawn telescope without light.
+_HALVINGS = 20
 
 
 @dataclass(frozen=True)
@@ -44,8 +51,14 @@ class TolerancedMerit:
         Residuals of the telescope as designed [m].
     by_draw, by_free : ndarray, shape [n, n_tolerance], [n, n_compensator]
         Their derivatives with respect to deviations and compensators.
+    changes : ndarray, shape [n_changed, n_compensator]
+        Changes of the derivatives `by_free` in drawn telescopes with their compensators, whose sum of squares is a mean
+        square.
+    combinations : ndarray, shape [n_compensator, n_combination]
+        Combinations of compensators that follow: those whose effect is larger than its changes. A tilt that hardly acts
+        on the fields would else go as far as its effect is small.
     setting : ndarray, shape [n_compensator, n]
-        Matrix from residuals to minus the best setting of compensators.
+        Matrix from residuals to minus the best setting of these combinations.
     """
 
     telescope: Telescope
@@ -59,6 +72,8 @@ class TolerancedMerit:
     residuals: np.ndarray
     by_draw: np.ndarray
     by_free: np.ndarray
+    changes: np.ndarray
+    combinations: np.ndarray
     setting: np.ndarray
 
     @classmethod
@@ -81,8 +96,9 @@ class TolerancedMerit:
         least = np.zeros(0)
         if compensators:
             least = NO_EFFECT * (criterion.judge.size_of_terms(columns) @ np.abs(matrix))[n:]
-        setting = _settings(by_free, compensators, least)
-        return cls(
+        no_changes = np.zeros((0, len(compensators)))
+        _require_effects(by_free, compensators, least)
+        toleranced = cls(
             telescope,
             tolerances,
             compensators,
@@ -94,8 +110,34 @@ class TolerancedMerit:
             residuals,
             by_draw,
             by_free,
-            setting,
+            no_changes,
+            *_best_settings(by_free, no_changes),
         )
+        if not compensators:
+            return toleranced
+        deviations = draw(tolerances, _SEED, _DRAWS)
+        for moves in (np.zeros((_DRAWS, len(compensators))), None):
+            # Moves that the deviations alone leave possible may be too large for derivatives themselves.
+            values = deviations, toleranced.moves(deviations) if moves is None else moves
+            changes = np.concatenate([toleranced.changes, toleranced._changes(*values)])
+            combinations, setting = _best_settings(by_free, changes)
+            toleranced = replace(toleranced, changes=changes, combinations=combinations, setting=setting)
+        return toleranced
+
+    def _changes(self, deviations: np.ndarray, moves: np.ndarray) -> np.ndarray:
+        """Return changes of `by_free` at deviations and moves of compensators, shape [n_changed, n_compensator]."""
+        changes = []
+        for deviation, move in zip(deviations, moves, strict=True):
+            for power in range(_HALVINGS):
+                values = np.append(deviation, 0.5**power * move)
+                try:
+                    slopes = self._derivatives(values)[1][:, len(self.tolerances) :]
+                except PachonError:
+                    continue
+                if np.isfinite(slopes).all():
+                    changes.append((slopes - self.by_free) / np.sqrt(len(deviations)))
+                    break
+        return np.concatenate(changes) if changes else np.zeros((0, len(self.compensators)))
 
     @cached_property
     def fixed(self) -> np.ndarray:
@@ -140,7 +182,7 @@ class TolerancedMerit:
         g, c, h = gradient[:n], gradient[n:], hessian[:n, :n]
         if self.compensators:
             # The minimum over the compensators is quadratic too (Schur's complement).
-            across, inverse = hessian[:n, n:], _scaled_inverse(hessian[n:, n:])
+            across, inverse = hessian[:n, n:], self._inverse_curvature
             start = start - 0.5 * float(c @ inverse @ c)
             g, h = g - across @ inverse @ c, h - across @ inverse @ across.T
         square = start + deviations @ g + 0.5 * np.einsum("ni,ij,nj->n", deviations, h, deviations)
@@ -150,7 +192,14 @@ class TolerancedMerit:
         """Return the compensators at the least of :meth:`quadratic` for deviations, shape [n, n_compensator]."""
         _, gradient, hessian = self.second_order
         n = len(self.tolerances)
-        return -(gradient[n:] + deviations @ hessian[:n, n:]) @ _scaled_inverse(hessian[n:, n:])
+        return -(gradient[n:] + deviations @ hessian[:n, n:]) @ self._inverse_curvature
+
+    @cached_property
+    def _inverse_curvature(self) -> np.ndarray:
+        """Inverse of the second derivatives by compensators, within their combinations that follow."""
+        n = len(self.tolerances)
+        inverse = _scaled_inverse(self.combinations.T @ self.second_order[2][n:, n:] @ self.combinations)
+        return np.asarray(self.combinations @ inverse @ self.combinations.T)
 
     @cached_property
     def second_order(self) -> tuple[float, np.ndarray, np.ndarray]:
@@ -160,7 +209,8 @@ class TolerancedMerit:
         usual moves are none, where by symmetry they do not respond to deviations to first order.
         """
         effect = np.linalg.norm(np.append(self.by_draw * self.spreads, self.residuals[:, None], axis=1))
-        steps = _STEP * np.append(self.spreads, effect / np.linalg.norm(self.by_free, axis=0))
+        by_free = np.linalg.norm(np.concatenate([self.by_free, self.changes]), axis=0)
+        steps = _STEP * np.append(self.spreads, effect / by_free)
         hessian = np.empty((len(steps), len(steps)))
         for i, step in enumerate(steps):
             ends = [self._gradient(sign * step * np.eye(len(steps))[i]) for sign in (1.0, -1.0)]
@@ -170,10 +220,14 @@ class TolerancedMerit:
 
     def _gradient(self, values: np.ndarray) -> np.ndarray:
         """Return the gradient of the square of the merit [m^2 per unit] at deviations and compensators."""
+        residuals, slopes = self._derivatives(values)
+        return np.asarray(2.0 * residuals @ slopes)
+
+    def _derivatives(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals [m], and their derivatives [m per unit], at deviations and compensators."""
         columns = ParameterColumns.at(self.prepared, self.parameters, self.matrix @ values)
         residuals, slopes = self.criterion.judge.derivatives(columns)
-        gradient: np.ndarray = 2.0 * residuals @ slopes @ self.matrix
-        return gradient
+        return residuals, slopes @ self.matrix
 
     def compensated(self, deviations: np.ndarray) -> np.ndarray:
         """Return deviations [n, n_tolerance] with their compensators behind, [n, n_tolerance + n_compensator]."""
@@ -206,10 +260,25 @@ def _scaled_inverse(hessian: np.ndarray) -> np.ndarray:
     return inverse / np.outer(scale, scale)
 
 
-def _settings(slopes: np.ndarray, names: tuple[str, ...], least: np.ndarray) -> np.ndarray:
-    """Return the matrix from residuals to minus the best setting of compensators, shape [n_free, n]."""
-    size = np.linalg.norm(slopes, axis=0)
-    for name, value, rounding in zip(names, size, least, strict=True):
+def _require_effects(slopes: np.ndarray, names: tuple[str, ...], least: np.ndarray) -> None:
+    """Raise DomainError of a compensator whose effect is rounding."""
+    for name, value, rounding in zip(names, np.linalg.norm(slopes, axis=0), least, strict=True):
         if not value > rounding:
             raise DomainError(f"compensator {name!r} has no effect on the merit: expected one that has")
-    return np.linalg.pinv(slopes / size, rcond=1e-9) / size[:, None] if names else np.zeros((0, len(slopes)))
+
+
+def _best_settings(slopes: np.ndarray, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the combinations of compensators that follow, and the matrix from residuals to minus their best setting.
+
+    Slopes and their changes together are made orthogonal and normal; the singular values of the slopes' part are then
+    the root of the fraction that is theirs.
+    """
+    if not slopes.shape[1]:
+        return np.zeros((0, 0)), np.zeros((0, len(slopes)))
+    size = np.linalg.norm(slopes, axis=0)
+    both, scales, axes = np.linalg.svd(np.concatenate([slopes, changes]) / size, full_matrices=False)
+    full = scales > _DEPENDENT * scales[0]
+    effects, fractions, turned = np.linalg.svd(both[: len(slopes), full], full_matrices=False)
+    follow = fractions**2 > 0.5
+    combinations = (axes[full].T / scales[full] @ turned[follow].T) / size[:, None]
+    return combinations, combinations / fractions[follow] @ effects[:, follow].T

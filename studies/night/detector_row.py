@@ -32,7 +32,7 @@ COLUMNS = {
     "ra": ("deg", "right ascension of the middle of the CCD, ICRS"),
     "dec": ("deg", "declination of the middle of the CCD, ICRS"),
     "zenithDistance": ("deg", "zenith distance of the pointing"),
-    "pixelScale": ("arcsec/pixel", "angle of a pixel"),
+    "pixelScale": ("arcsec/pixel", "angle of a pixel in the middle of the CCD, root of its area"),
     "psfSigma": ("pixel", "determinant radius (Ixx Iyy - Ixy^2)^(1/4) of the PSF in the middle of the CCD"),
     "psfIxx": ("pixel2", "adaptive moment of the PSF along the pixels' x"),
     "psfIyy": ("pixel2", "along their y"),

@@ -14,6 +14,7 @@ from ...core.errors import DomainError, PachonError, ProductError
 from ...core.number_text import counted
 from ...core.products import Columns, Stamp, column, is_whole, read_fits, table_hdu, write_fits
 from ...core.progress import Reporter
+from ...core.units import ARCSEC
 from ...models.camera.camera import Camera
 from ...pipeline.experiment import Experiment
 from ...pipeline.listed_visit import visit_experiment
@@ -228,6 +229,8 @@ def _row(
     if math.isfinite(visit.weight):
         noise["weight"] = visit.weight
     ra, dec = pointing.to_celestial(pointing.to_sky(np.tan(exposure.holdout.fields[:1])))[0]
+    jacobian = sky_jacobians(experiment, [shapes.xy[:1]])[0][0]
+    pixel_scale = camera.pixel_size * math.sqrt(abs(float(np.linalg.det(jacobian))))
     sigma, area = float(shapes.sigma[0]), float(shapes.area[0])
     return {
         "detector": ccd,
@@ -236,7 +239,7 @@ def _row(
         "ra": math.degrees(ra),
         "dec": math.degrees(dec),
         "zenithDistance": math.degrees(visit.zenith_angle),
-        "pixelScale": experiment.band.pixel_scale * math.degrees(1.0) * 3600.0,
+        "pixelScale": pixel_scale / ARCSEC,
         "psfSigma": sigma,
         "psfIxx": float(xx),
         "psfIyy": float(yy),

@@ -7,7 +7,7 @@ import pytest
 from pachon.commands import config_kinds, stored_names
 from pachon.commands.cli import main
 from pachon.commands.config import example, keys_of, unit_of
-from pachon.core.errors import UnknownNameError
+from pachon.core.errors import ConfigError, UnknownNameError
 from pachon.core.set_keys import with_set_keys
 from pachon.pipeline.config import Configuration
 
@@ -100,6 +100,23 @@ def test_a_wrong_setting_is_one_line(command, text, parts, in_folder, capsys):
     for part in parts:
         assert part in error
     assert list(in_folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("stated", ["file", "--set"])
+@pytest.mark.parametrize(("command", "function"), [("shim", "shimming.shim.shim"), ("study", "psf_choice.study.study")])
+def test_ccds_of_the_configuration_are_used(command, function, stated, in_folder, monkeypatch):
+    """Not all CCDs, or the nine of a study, in their place."""
+    used_ccds = []
+
+    def record(first, *_, **__):
+        used_ccds.append(getattr(first, "config", first).ccds)
+        raise ConfigError("seen")
+
+    monkeypatch.setattr(f"pachon.studies.{function}", record)
+    (in_folder / "run.yaml").write_text("ccds: [R01_S02, R22_S11]\n")
+    assert main([command, *(["run.yaml"] if stated == "file" else ["--set", "ccds=[R01_S02, R22_S11]"])]) == 2
+    assert main([command, "run.yaml", "--ccds", "R22_S00"]) == 2
+    assert used_ccds == [("R01_S02", "R22_S11"), ("R22_S00",)]
 
 
 def test_settings_are_those_of_a_file(in_folder):

@@ -55,6 +55,19 @@ def image(small_run):
     return scene.exposed()
 
 
+@pytest.mark.long
+def test_zero_point_has_the_vignetting_of_the_middle(tiny):
+    """At the edge of the field a star is 0.1 mag fainter than on the axis; its flux and ZEROPNT give its magnitude."""
+    run = Experiment.from_config(
+        tiny(ccds=("R01_S02",), psf__engine="long_exposure", psf__n_pupil=300, psf__stamp=63, stars__truth=24)
+    )
+    image = draw_ccd(run, "R01_S02", two_galaxies, window=Window(1700, 1700, 600, 600)).exposed()
+    galaxies = np.flatnonzero(~image.objects["STAR"])
+    flux = image.objects["FLUX"][galaxies] / image.header["GAIN"]
+    np.testing.assert_allclose(image.zero_point - 2.5 * np.log10(flux), image.objects["MAG"][galaxies], atol=0.01)
+    assert Exposure.of_run(run).zero_point - image.zero_point == pytest.approx(0.1, abs=0.03)
+
+
 def test_stars_are_their_own_psfs_times_their_electrons(stars, small_run):
     field = ccd_stars(small_run, "R22_S11", 0.7 * ARCSEC)
     pixels = np.stack([stars.objects["X"], stars.objects["Y"]], axis=1)

@@ -110,3 +110,21 @@ def test_yield_and_its_interval():
     everything = Yield.of(np.zeros(10), 0.5)
     assert everything.high == pytest.approx(1.0)
     assert everything.low < 1.0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("fields", [[[0.0, 0.0], [0.0, 8.0], [0.0, -11.0]], [[0.0, 8.0]]])
+def test_a_tilt_that_hardly_acts_on_the_fields_stays_small(triplet, fields):
+    """All fields on one axis leave a tilt open, one field the tilt against the focus; least squares would take 260 deg.
+
+    Merits are then those of the focus alone.
+    """
+    tolerances = (Tolerance("S3.rx", 1e-3), Tolerance("S3.ry", 1e-3))
+    request = pachon.Request.of(triplet, np.deg2rad(fields), n_pupil=3)
+    how = dict(merit="spots", n=5, seed=4)
+    focus = monte_carlo(request, tolerances, method="traced", compensators=["Image.dz"], **how)
+    free = ["Image.dz", "Image.ry"] if len(fields) > 1 else ["Image.dz", "Image.rx"]
+    for method in ("traced", "linear", "quadratic"):
+        found = monte_carlo(request, tolerances, method=method, compensators=free, **how)
+        assert np.all(np.abs(found.moves[:, 1]) < 0.02)
+        assert found.merit == pytest.approx(focus.merit, rel=5e-3)
