@@ -1,8 +1,8 @@
 r"""Winds and strengths of the layers of an exposure, from the shapes of its stars.
 
 The covariance of the shapes is that of theory (:class:`.LayerCovariance`); winds, strengths, Fried parameter and outer
-scale are those of the largest likelihood, with the layers of a site as prior: speeds and strengths within a third of
-theirs, winds from any direction. The likelihood is that of blocks of neighbouring stars, as in :mod:`.likelihood`. Its
+scale are those of the largest likelihood, with the layers of a site as prior: speeds within 30 % and strengths within
+15 % of theirs, winds from any direction. The likelihood is that of blocks of neighbouring stars, as in :mod:`.likelihood`. Its
 gradient follows the chain rule through a table of covariances at some lags, whose derivatives are differences.
 
 Winds of all layers turned around give the same covariances, and weak layers hardly matter: winds are found as far as
@@ -54,10 +54,10 @@ _DIRECTIONS = 64
 # Standard deviations of the priors: logarithms of speeds, strengths, Fried parameter, which the mean size of the stars
 # gives, outer scale and nuggets.
 _SPEED = 0.3
-_STRENGTH = 0.3
+_STRENGTH = 0.15
 _FRIED = 0.05
 _OUTER_SCALE = 0.3
-_NUGGET = 2.0
+_NUGGET = 1.0
 # Unit of the components of winds [m/s], and least speed of a prior.
 _WIND = 10.0
 _LEAST_SPEED = 0.5
@@ -65,7 +65,7 @@ _LEAST_SPEED = 0.5
 _WIND_STEP = 0.05
 _STEP = 0.01
 # Nugget over the variance: least, at the start, and most.
-_NUGGETS = (0.005, 0.02, 1.0)
+_NUGGETS = (0.003, 0.01, 1.0)
 # Gain of the likelihood that ends the search, a tenth of what matters, over its size for each value of a star.
 _GAIN = 0.05
 # Most steps of the search, and of one from a solution.

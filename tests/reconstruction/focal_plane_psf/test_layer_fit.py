@@ -12,7 +12,7 @@ from pachon.wavefront.atmosphere.moment_covariance import ExposedAir, MomentResp
 AIR = ExposedAir((0.0, 4000.0), (0.65, 0.35), ((6.0, 2.0), (-4.0, 9.0)), 15.0, 0.16, 25.0, 40.0, 8.4, 0.6)
 RESPONSE = MomentResponse(6.4e10, 6.7e10, (1e10, 1e20), (1e10, 1e20))
 #: Of the prior: winds of some speed, strengths, Fried parameter, outer scale, nuggets.
-CURVATURE = [20.0] * 4 + [11.1] * 2 + [400.0, 11.1] + [0.25] * 3
+CURVATURE = [20.0] * 4 + [44.0] * 2 + [400.0, 11.1] + [1.0] * 3
 CONSTANT = np.array([1e-6, 1e-6, 1e-6])
 
 
