@@ -2,8 +2,9 @@ r"""Winds and strengths of the layers of an exposure, from the shapes of its sta
 
 The covariance of the shapes is that of theory (:class:`.LayerCovariance`); winds, strengths, Fried parameter and outer
 scale are those of the largest likelihood, with the layers of a site as prior: speeds within 30 % and strengths within
-15 % of theirs, winds from any direction. The likelihood is that of blocks of neighbouring stars, as in :mod:`.likelihood`. Its
-gradient follows the chain rule through a table of covariances at some lags, whose derivatives are differences.
+15 % of theirs, winds from any direction. The likelihood is that of blocks of neighbouring stars, as in
+:mod:`.likelihood`. Its gradient follows the chain rule through a table of covariances at some lags, whose derivatives
+are differences.
 
 Winds of all layers turned around give the same covariances, and weak layers hardly matter: winds are found as far as
 they change the prediction.
