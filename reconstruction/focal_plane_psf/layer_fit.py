@@ -62,6 +62,8 @@ _NUGGET = 1.0
 # Unit of the components of winds [m/s], and least speed of a prior.
 _WIND = 10.0
 _LEAST_SPEED = 0.5
+# Strength of a layer that a site lists without any, for its logarithm.
+_LEAST_STRENGTH = 1e-12
 # Steps of the differences: of winds, over less of which the sums over baselines are not smooth, and of logarithms.
 _WIND_STEP = 0.05
 _STEP = 0.01
@@ -154,7 +156,8 @@ class LayerFit:
         numbers = np.unique(np.linspace(0, len(blocks) - 1, min(len(blocks), _MOST_BLOCKS)).astype(int))
         #: Stars of each block of the likelihood.
         self.blocks = [blocks[k] for k in numbers]
-        extent = max(float(np.hypot(*np.ptp(places.xy[block], axis=0))) for block in self.blocks)
+        extents = [float(np.hypot(*np.ptp(places.xy[block], axis=0))) for block in self.blocks]
+        extent = max(*extents, float(np.max(theory.camera.half_sizes)))
         self._lags = PolarLags.of(prior, theory.reach(extent), *_SEARCH)
         to_sky = theory.to_sky.T
         self._weights = [
@@ -203,7 +206,8 @@ class LayerFit:
         """Find the winds from those of a covariance."""
         start = self._parameters(np.array(covariance.air.velocities))
         n, air = len(self._speeds), covariance.air
-        start[2 * n : 3 * n] = np.log(np.array(air.weights) / np.array(self._prior.weights))
+        strength, usual = (np.maximum(weights, _LEAST_STRENGTH) for weights in (air.weights, self._prior.weights))
+        start[2 * n : 3 * n] = np.log(strength / usual)
         start[3 * n] = math.log(air.r0 / self._prior.r0)
         start[3 * n + 1] = math.log(air.outer_scale / self._prior.outer_scale)
         start[3 * n + 2 :] = np.log(covariance.nugget / self._variance)
