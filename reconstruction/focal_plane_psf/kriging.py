@@ -23,8 +23,8 @@ from .layer_covariance import LayerCovariance
 
 #: Stars that a prediction is made from, where each shape is predicted from itself.
 NEIGHBOURS = 700
-#: The same where all three shapes are predicted from all.
-NEIGHBOURS_OF_ALL = 300
+#: The same where all three shapes are predicted from all: with 300 errors are 0.1 % smaller, in 1.7 times the time.
+NEIGHBOURS_OF_ALL = 233
 
 
 @dataclass(frozen=True)
