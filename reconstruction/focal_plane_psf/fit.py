@@ -185,7 +185,7 @@ class ExposureFit:
 
     def linearise(self) -> None:
         """Evaluate the optics about the parameters of the exposure."""
-        aberration = wavefront(self.instrument.telescope, self.exposure[:-1].reshape(3, -1), self._radius)
+        aberration = self._aberration
         seeing = float(self.exposure[-1])
         repetition = ", again" if self._response is not None else ""
         with self.reporter.stage(f"optics at the stars{repetition}", total=5 * len(self.data)) as stage:
@@ -220,6 +220,10 @@ class ExposureFit:
         self.exposure = self.exposure + change
         # The model is linear in them.
         return [b._replace(vector=b.vector - b.matrix[:, -N_EXPOSURE:] @ change) for b in blocks]
+
+    @property
+    def _aberration(self) -> ResidualWavefront:
+        return wavefront(self.instrument.telescope, self.exposure[:-1].reshape(3, -1), self._radius)
 
     @property
     def _radius(self) -> float:
@@ -269,8 +273,7 @@ class ExposureFit:
         instrument, telescope = self.instrument, self.instrument.telescope
         air = ExposedAir.of(instrument.atmosphere, telescope.pupil_diameter, telescope.pupil_obscuration)
         air = air._replace(r0=air.r0 * math.exp(float(self.exposure[-1])))
-        aberration = wavefront(telescope, self.exposure[:-1].reshape(3, -1), self._radius)
-        response, jacobian = instrument.moment_response(aberration, float(self.exposure[-1]), self.threads)
+        response, jacobian = instrument.moment_response(self._aberration, float(self.exposure[-1]), self.threads)
         _, _, columns = self._columns()
         # The coefficients on the axis are those of a star.
         products = mean_products(columns[:, : len(NOLL)])
@@ -326,8 +329,8 @@ class ExposureFit:
             matrix, vector = np.zeros((len(used), len(used))), np.zeros(len(used))
             for shapes, covariance in shape_groups(self.covariances):
                 design = _design_of_shapes(terms, slopes[index], columns[index], shapes)
-                root = covariance.root(block_places, in_order(self.data.noise[index], shapes))
-                design_and_residuals = np.column_stack([design, in_order(residuals[index], shapes)])
+                root = covariance.root(block_places, in_order(self.data.noise[index][:, shapes]))
+                design_and_residuals = np.column_stack([design, in_order(residuals[index][:, shapes])])
                 white = scipy.linalg.solve_triangular(root, design_and_residuals, lower=True, check_finite=False)
                 matrix += white[:, :-1].T @ white[:, :-1]
                 vector += white[:, :-1].T @ white[:, -1]
@@ -395,8 +398,8 @@ class ExposureFit:
             block_places = self.data.places[index]
             total = 0.0
             for shapes, covariance in shape_groups(self.covariances):
-                root = covariance.root(block_places, in_order(self.data.noise[index], shapes))
-                ordered = in_order(residuals[index], shapes)
+                root = covariance.root(block_places, in_order(self.data.noise[index][:, shapes]))
+                ordered = in_order(residuals[index][:, shapes])
                 white = scipy.linalg.solve_triangular(root, ordered, lower=True, check_finite=False)
                 total += float(white @ white)
             return total
@@ -451,5 +454,5 @@ class ExposureFit:
             self.exposure,
             self.covariance,
             self.prior.focal_plane(self.heights),
-            wavefront(self.instrument.telescope, self.exposure[:-1].reshape(3, -1), self._radius),
+            self._aberration,
         )

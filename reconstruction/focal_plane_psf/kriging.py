@@ -19,7 +19,7 @@ import scipy.linalg
 from ...core.threads import one_blas_thread, thread_count
 from ..gaussian_field import inverse_from_cholesky, leave_one_out_residuals
 from .covariance import Covariance, Places
-from .layer_covariance import LayerCovariance
+from .layer_covariance import LayerCovariance, in_order
 
 #: Stars that a prediction is made from, where each shape is predicted from itself.
 NEIGHBOURS = 700
@@ -70,8 +70,8 @@ def neighbourhood(
     stars: np.ndarray,
 ) -> Neighbourhood:
     """Solve for the weights of stars of given indices; values and variances of their noise [n, k] are of all stars."""
-    root = covariance.root(places[stars], noise[stars].T.ravel())
-    return Neighbourhood(stars, root, scipy.linalg.cho_solve((root, True), values[stars].T.ravel(), check_finite=False))
+    root = covariance.root(places[stars], in_order(noise[stars]))
+    return Neighbourhood(stars, root, scipy.linalg.cho_solve((root, True), in_order(values[stars]), check_finite=False))
 
 
 def leave_one_out(near: Neighbourhood) -> tuple[np.ndarray, np.ndarray]:

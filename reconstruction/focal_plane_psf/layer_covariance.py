@@ -124,6 +124,6 @@ def shape_groups(
     return [(slice(i, i + 1), covariance) for i, covariance in enumerate(covariances)]
 
 
-def in_order(values: np.ndarray, shapes: slice) -> np.ndarray:
-    """Return values [n, 3] of some shapes, one shape after the other."""
-    return np.ascontiguousarray(values[:, shapes].T).ravel()
+def in_order(values: np.ndarray) -> np.ndarray:
+    """Return values [n, k] of k shapes one shape after the other, [k n]."""
+    return values.T.ravel()

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-import scipy.sparse
 
 from ...core.random_streams import stream
 from ...models.camera.camera import Camera
@@ -29,6 +28,7 @@ from ...wavefront.atmosphere.moment_covariance import (
     MomentResponse,
     MomentSampling,
     as_matrices,
+    as_pairs,
     moment_covariance,
 )
 from ...wavefront.atmosphere.polar_lags import PolarLags
@@ -116,7 +116,7 @@ class LayerTheory:
         covariance = moment_covariance(air, lags, response.aberration, response.lit, self.threads, sampling)
         turned = _turn(self.jacobian)
         shapes = turned @ response.shapes(as_matrices(covariance.total(response))) @ turned.T
-        return np.stack([shapes[:, i, j] for i, j in PAIRS], axis=1)
+        return as_pairs(shapes)
 
     def by_wavefront(self, air: ExposedAir, lags: np.ndarray) -> np.ndarray:
         """Return covariances of the shapes by the mean wavefront of the air and the optics' aberrations, [n_lag, 6]."""
@@ -129,7 +129,7 @@ class LayerTheory:
         reach = self.reach(2.0 * (float(np.hypot(*camera.centers.T).max()) + math.sqrt(2.0) * side))
         polar, smooth = PolarLags.of(air, reach, *_RESULT), PolarLags.of(air, reach)
         values = self.by_moments(air, polar.lags, _FINE)
-        values += interpolation(smooth, polar.lags) @ self.by_wavefront(air, smooth.lags)
+        values += smooth.interpolation(polar.lags) @ self.by_wavefront(air, smooth.lags)
         return LayerCovariance(air, self.to_sky, polar, polar.table(values), constant, nugget)
 
 
@@ -161,7 +161,7 @@ class LayerFit:
         self._lags = PolarLags.of(prior, theory.reach(extent), *_SEARCH)
         to_sky = theory.to_sky.T
         self._weights = [
-            interpolation(self._lags, ((places.xy[b][:, None] - places.xy[b]) @ to_sky).reshape(-1, 2))
+            self._lags.interpolation(((places.xy[b][:, None] - places.xy[b]) @ to_sky).reshape(-1, 2))
             for b in self.blocks
         ]
         self._data: list[_BlockData] = []
@@ -177,10 +177,10 @@ class LayerFit:
         """
 
         def block(index: np.ndarray) -> _BlockData:
-            factor = in_order(values[index], slice(0, 3))[:, None]
+            factor = in_order(values[index])[:, None]
             if spread is not None:
                 factor = np.concatenate([factor, spread(index)], axis=1)
-            return _BlockData(in_order(noise[index], slice(0, 3)), factor)
+            return _BlockData(in_order(noise[index]), factor)
 
         self._data = map_on_threads(block, self.blocks, self._theory.threads)
 
@@ -332,33 +332,3 @@ def _turn(jacobian: np.ndarray) -> np.ndarray:
         turned = turn @ moments @ turn.T
         out[:2, k] = turned[0, 0] - turned[1, 1], 2.0 * turned[0, 1]
     return out
-
-
-def interpolation(lags: PolarLags, places: np.ndarray) -> scipy.sparse.csr_matrix:
-    """Return weights of the values at lags in those at places [n, 2] [rad]: Lagrange's cubics in ring and spoke."""
-    ring = np.log1p(np.hypot(*places.T) / lags.unit) / lags.step
-    spoke = np.arctan2(places[:, 1], places[:, 0]) / np.pi * lags.spokes
-    before_ring, before_spoke = np.minimum(ring.astype(int), lags.rings - 3), np.floor(spoke).astype(int)
-    around = np.arange(-1, 3)
-    # On the other side of the centre the rings come in reverse, with the same values.
-    rings = np.abs(before_ring[:, None] + around)[:, :, None]
-    spokes = ((before_spoke[:, None] + around) % lags.spokes)[:, None]
-    columns = np.where(rings == 0, 0, 1 + (rings - 1) * lags.spokes + spokes)
-    weight = _cubic(ring - before_ring)[:, :, None] * _cubic(spoke - before_spoke)[:, None]
-    shape = (len(places), 1 + (lags.rings - 1) * lags.spokes)
-    starts = np.arange(0, 16 * len(places) + 1, 16)
-    return scipy.sparse.csr_matrix((weight.ravel().astype(np.float32), columns.ravel(), starts), shape=shape)
-
-
-def _cubic(part: np.ndarray) -> np.ndarray:
-    """Return weights of the four values around places between the second and the third, [n, 4]."""
-    t = part
-    return np.stack(
-        [
-            t * (t - 1.0) * (2.0 - t) / 6.0,
-            (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0,
-            t * (t + 1.0) * (2.0 - t) / 2.0,
-            t * (t + 1.0) * (t - 1.0) / 6.0,
-        ],
-        axis=1,
-    )

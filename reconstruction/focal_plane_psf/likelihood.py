@@ -20,7 +20,7 @@ import scipy.linalg
 
 from ..gaussian_field import inverse_from_cholesky
 from .covariance import CCD_TERMS, COMPONENTS, Covariance, Places, ccd_terms
-from .layer_covariance import LayerCovariance
+from .layer_covariance import LayerCovariance, in_order
 
 #: Largest number of stars in a block.
 BLOCK = 300
@@ -190,8 +190,8 @@ def log_likelihood(
     """Return the logarithm of the likelihood in blocks of shapes [n, k] that covary, without the constant of 2 pi."""
     total = 0.0
     for index in blocks:
-        root = covariance.root(places[index], noise[index].T.ravel())
-        white = scipy.linalg.solve_triangular(root, values[index].T.ravel(), lower=True, check_finite=False)
+        root = covariance.root(places[index], in_order(noise[index]))
+        white = scipy.linalg.solve_triangular(root, in_order(values[index]), lower=True, check_finite=False)
         total -= 0.5 * float(white @ white) + float(np.log(np.diagonal(root)).sum())
     return total
 

@@ -196,7 +196,7 @@ class FocalPlanePsf(ModelFields, Result):
             residuals, variance = field.leave_one_out_residuals(threads)
         predicted = np.full((len(catalogue), 3), np.nan)
         predicted[used] = field.data.values - residuals
-        chi2 = {name: float(v) for name, v in zip(SHAPES, np.nanmean(residuals**2 / variance, axis=0), strict=True)}
+        chi2 = {name: float(v) for name, v in zip(SHAPES, (residuals**2 / variance).mean(axis=0), strict=True)}
         model = cls(
             field,
             used,

@@ -24,7 +24,7 @@ from ...core.warp_arrays import warp_array
 from ...models.zernike_polynomials import noll_to_nm
 from .field_kernels import add_wavefronts, factor_spectra, pairs, read_splines, spread_over_grid, zernikes
 from .mean_wavefront import mean_wavefront_covariance, radial_transform
-from .moment_covariance import PAIRS, ExposedAir, MomentResponse, as_matrices, moment_covariance
+from .moment_covariance import ExposedAir, MomentResponse, as_matrices, as_pairs, moment_covariance
 from .polar_lags import PolarLags
 from .turbulence import path_spectrum
 
@@ -156,7 +156,7 @@ def moment_spectrum(
     # What stars half a period apart share, all stars do.
     shared = _positive(as_matrices(polar[np.searchsorted(polar_lags.radius, 0.5 * grid.side)].mean(axis=0)))
     scale = float(polar[0, 0, 2])
-    constant = np.array([shared[i, j] for i, j in PAIRS])
+    constant = as_pairs(shared)
     half = grid.size // 2 + 1
     covariance = np.empty((6, half, grid.size), dtype=np.float32)
     launch(

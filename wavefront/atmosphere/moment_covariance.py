@@ -199,6 +199,11 @@ def as_matrices(pairs: np.ndarray) -> np.ndarray:
     return out
 
 
+def as_pairs(matrices: np.ndarray) -> np.ndarray:
+    """Return the values of :data:`PAIRS` [..., 6] of symmetric matrices [..., 3, 3]."""
+    return np.stack([matrices[..., i, j] for i, j in PAIRS], axis=-1)
+
+
 def moment_covariance(
     air: ExposedAir,
     lags: np.ndarray,

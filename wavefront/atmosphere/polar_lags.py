@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple, Self
 
 import numpy as np
+import scipy.sparse
 
 from .moment_covariance import ExposedAir
 
@@ -50,3 +51,35 @@ class PolarLags(NamedTuple):
         """Return values at :attr:`lags` [n, ...] by rings and spokes, [ring, spoke, ...]."""
         first = np.repeat(values[:1], self.spokes, axis=0)
         return np.concatenate([first, values[1:]]).reshape(self.rings, self.spokes, *values.shape[1:])
+
+    def interpolation(self, places: np.ndarray) -> scipy.sparse.csr_matrix:
+        """Return weights [n, n_lag] of values at :attr:`lags` in those at places [n, 2] [rad].
+
+        They are Lagrange's cubics in ring and spoke, as in :func:`.read_lags`.
+        """
+        ring = np.log1p(np.hypot(*places.T) / self.unit) / self.step
+        spoke = np.arctan2(places[:, 1], places[:, 0]) / np.pi * self.spokes
+        before_ring, before_spoke = np.minimum(ring.astype(int), self.rings - 3), np.floor(spoke).astype(int)
+        around = np.arange(-1, 3)
+        # On the other side of the centre the rings come in reverse, with the same values.
+        rings = np.abs(before_ring[:, None] + around)[:, :, None]
+        spokes = ((before_spoke[:, None] + around) % self.spokes)[:, None]
+        columns = np.where(rings == 0, 0, 1 + (rings - 1) * self.spokes + spokes)
+        weight = _cubic(ring - before_ring)[:, :, None] * _cubic(spoke - before_spoke)[:, None]
+        shape = (len(places), 1 + (self.rings - 1) * self.spokes)
+        starts = np.arange(0, 16 * len(places) + 1, 16)
+        return scipy.sparse.csr_matrix((weight.ravel().astype(np.float32), columns.ravel(), starts), shape=shape)
+
+
+def _cubic(part: np.ndarray) -> np.ndarray:
+    """Return weights of the four values around places between the second and the third, [n, 4]."""
+    t = part
+    return np.stack(
+        [
+            t * (t - 1.0) * (2.0 - t) / 6.0,
+            (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0,
+            t * (t + 1.0) * (2.0 - t) / 2.0,
+            t * (t + 1.0) * (t - 1.0) / 6.0,
+        ],
+        axis=1,
+    )
