@@ -3,7 +3,7 @@
 Run: python benchmarks/layers_in_focal_plane_psf.py [--seeds 11 12 13] [--heights unknown] [--stars 40]
 
 Exposures of 15 s of the LSST through screens, by the fast engine at one wavelength. On each CCD there are observed
-stars with noise of 1/SNR (30 to 1000, as counts of stars have them), and ten places without noise, where both models
+stars with noise of 1/SNR (30 to 1000, as counts of stars have them), and fifty places without noise, where both models
 are compared with what was simulated: rms of e1, e2 and ln size, and mean square over the predicted variance, within
 1.75 degrees and beyond, where vignetting changes within a CCD. Directions of the wind are not given to the fit. One
 line a model with the time of its fit, and the winds found beside the true ones.
@@ -19,7 +19,7 @@ from pachon import FocalPlanePsf
 from pachon.reconstruction import Instrument
 
 WAVELENGTHS = [620e-9]
-HELD_OUT = 10
+HELD_OUT = 50
 BATCH = 1000
 FAINTEST, BRIGHTEST, SLOPE = 30.0, 1000.0, 0.8
 

@@ -50,13 +50,14 @@ _RESULT = (28, 36)
 _FINE = MomentSampling(0.7, 0.35, 0.7, 0.25)
 # Wind that it is chosen for, over the fastest of the prior.
 _FASTEST = 1.3
-# Directions of all winds that are tried first.
+# Directions of all winds that are tried first, and those over which the part of the mean wavefront is averaged before.
 _DIRECTIONS = 64
+_FIRST_DIRECTIONS = 4
 # Standard deviations of the priors: logarithms of speeds, strengths, Fried parameter, which the mean size of the stars
 # gives, outer scale and nuggets.
 _SPEED = 0.3
 _STRENGTH = 0.15
-_FRIED = 0.05
+_FRIED = 0.03
 _OUTER_SCALE = 0.3
 _NUGGET = 1.0
 # Unit of the components of winds [m/s], and least speed of a prior.
@@ -195,12 +196,17 @@ class LayerFit:
             angle = stream(0, "directions of layers").uniform(0.0, 2.0 * np.pi, (_DIRECTIONS, len(self._speeds)))
             velocities = list(self._speeds[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
         starts = [self._parameters(v) for v in velocities]
+        # Without it strengths would make up for it. By each wind it would take ten times as long as the likelihood.
+        first = [self._wavefront_part(start) for start in starts[:_FIRST_DIRECTIONS]]
+        self._by_wavefront = np.mean(first, axis=0)
         values = []
         for start in starts:
             values.append(self._likelihood(self._table(start), self._nugget(start), gradient=False)[0])
             if advance is not None:
                 advance(1)
-        return self._climb(starts[int(np.argmax(values))], _ITERATIONS, advance)
+        best = starts[int(np.argmax(values))]
+        self._by_wavefront = self._wavefront_part(best)
+        return self._climb(best, _ITERATIONS, advance)
 
     def improve(self, covariance: LayerCovariance, advance: Callable[[int], None] | None = None) -> LayerCovariance:
         """Find the winds from those of a covariance."""
@@ -211,7 +217,7 @@ class LayerFit:
         start[3 * n] = math.log(air.r0 / self._prior.r0)
         start[3 * n + 1] = math.log(air.outer_scale / self._prior.outer_scale)
         start[3 * n + 2 :] = np.log(covariance.nugget / self._variance)
-        self._by_wavefront = self._theory.by_wavefront(air, self._lags.lags)
+        self._by_wavefront = self._wavefront_part(start)
         return self._climb(start, _AGAIN, advance)
 
     def _climb(self, start: np.ndarray, steps: int, advance: Callable[[int], None] | None) -> LayerCovariance:
@@ -253,6 +259,10 @@ class LayerFit:
             r0=prior.r0 * math.exp(parameters[3 * n]),
             outer_scale=prior.outer_scale * math.exp(parameters[3 * n + 1]),
         )
+
+    def _wavefront_part(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the part of the mean wavefront in the covariances at the lags, [n_lag, 6]."""
+        return self._theory.by_wavefront(self._air(parameters), self._lags.lags)
 
     def _nugget(self, parameters: np.ndarray) -> np.ndarray:
         return np.asarray(self._variance * np.exp(parameters[-3:]))

@@ -12,7 +12,7 @@ from pachon.wavefront.atmosphere.moment_covariance import ExposedAir, MomentResp
 AIR = ExposedAir((0.0, 4000.0), (0.65, 0.35), ((6.0, 2.0), (-4.0, 9.0)), 15.0, 0.16, 25.0, 40.0, 8.4, 0.6)
 RESPONSE = MomentResponse(6.4e10, 6.7e10, (1e10, 1e20), (1e10, 1e20))
 #: Of the prior: winds of some speed, strengths, Fried parameter, outer scale, nuggets.
-CURVATURE = [20.0] * 4 + [44.0] * 2 + [400.0, 11.1] + [1.0] * 3
+CURVATURE = [20.0] * 4 + [44.0] * 2 + [1111.0, 11.1] + [1.0] * 3
 CONSTANT = np.array([1e-6, 1e-6, 1e-6])
 
 
@@ -57,7 +57,7 @@ def test_gradients_are_those_of_the_likelihood(theory, places, drawn):
         step = np.zeros(len(start))
         step[k] = size
         difference = (fit._negative_log_posterior(start + step)[0] - value) / size
-        # The prior curves by up to 1 / 0.05^2 within a step.
+        # The prior curves by up to 1 / 0.03^2 within a step.
         assert gradient[k] == pytest.approx(difference, abs=0.1 + 0.03 * abs(difference) + 0.5 * size * CURVATURE[k]), k
 
 
