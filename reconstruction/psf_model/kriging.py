@@ -336,8 +336,9 @@ def _sky_pixels(shape: tuple[int, ...]) -> np.ndarray:
 def sky_of_stars(deviations: np.ndarray, shape: tuple[int, ...], masked: np.ndarray | None) -> np.ndarray:
     """Return the variance of a pixel of sky of each star, [n], from deviations [n, n_pixels]."""
     sky = _sky_pixels(shape)
+    # In single precision, whose medians take half of the time: noise is known to some per cent.
     outer = None if masked is None else masked.reshape(len(deviations), -1)[:, sky]
-    return _sky_variance(deviations[:, sky], outer)
+    return _sky_variance(deviations[:, sky].astype(np.float32), outer)
 
 
 def _noise_correlations(
@@ -354,13 +355,14 @@ def _noise_correlations(
     sky = _sky_pixels((ny, nx)).reshape(ny, nx)
     # A mean of stars keeps the correlation, their median does not.
     weights = 1.0 / np.maximum(sky_variance, _LEAST_SKY * sky_variance.max())
-    pixels = deviations - np.tensordot(weights / weights.sum(), deviations, axes=1)
-    pixels = pixels / np.maximum(RMS_PER_MAD * row_medians(np.abs(pixels[:, sky])), np.finfo(float).tiny)[:, None, None]
+    deviations = deviations.astype(np.float32)
+    pixels = deviations - np.tensordot((weights / weights.sum()).astype(np.float32), deviations, axes=1)
+    pixels /= np.maximum(RMS_PER_MAD * row_medians(np.abs(pixels[:, sky])), np.finfo(np.float32).tiny)[:, None, None]
     # Cosmic rays and neighbours would correlate.
     used = (np.abs(pixels) < _CLIP) & sky & (True if masked is None else ~masked)
     # In rows with so many dark pixels behind them that no lag leads into the light of another one.
     room = ((0, 0), (0, max(dy for dy, _ in _LAGS)), (0, max(dx for _, dx in _LAGS)))
-    flags = np.pad(used.astype(np.float64), room)
+    flags = np.pad(used.astype(np.float32), room)
     flags, light = flags.ravel(), np.pad(np.where(used, pixels, 0.0), room).ravel()
     square = (light @ light) / max(used.sum(), 1)
     correlations = {}
@@ -404,7 +406,7 @@ def _sky_variance(outer: np.ndarray, masked: np.ndarray | None = None) -> np.nda
     for _ in range(_SKY_PASSES):
         weights = 1.0 / np.maximum(variance, _LEAST_SKY * variance.max())
         weights /= weights.sum()
-        sky_pixels = outer - weights @ outer
+        sky_pixels = outer - weights.astype(outer.dtype) @ outer
         if masked is not None:
             sky_pixels = np.where(masked & ~masked.all(axis=1, keepdims=True), np.nan, sky_pixels)
         rms = RMS_PER_MAD * median(np.abs(sky_pixels - median(sky_pixels)[:, None]))
