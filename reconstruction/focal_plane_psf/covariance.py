@@ -37,17 +37,33 @@ class Places:
         Number of the CCD.
     uv : ndarray, shape [n, 2]
         Positions from the centre of the CCD, in halves of its side.
+    amplitude : ndarray, shape [n], or None
+        What turbulence adds to shapes there, over its mean over the field; None for 1 everywhere.
     """
 
     xy: np.ndarray
     ccd: np.ndarray
     uv: np.ndarray
+    amplitude: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.xy)
 
     def __getitem__(self, chosen: np.ndarray | slice) -> Places:
-        return Places(self.xy[chosen], self.ccd[chosen], self.uv[chosen])
+        amplitude = None if self.amplitude is None else self.amplitude[chosen]
+        return Places(self.xy[chosen], self.ccd[chosen], self.uv[chosen], amplitude)
+
+    def amplitudes_with(self, other: Places) -> np.ndarray | float:
+        """Return products of the amplitudes here and at other places, [n, m]; 1 where neither have any."""
+        if self.amplitude is None or other.amplitude is None:
+            assert self.amplitude is other.amplitude, "both or neither have amplitudes"
+            return 1.0
+        return np.outer(self.amplitude, other.amplitude)
+
+    @property
+    def squares(self) -> np.ndarray | float:
+        """Squares of the amplitudes, [n]; 1 without any."""
+        return 1.0 if self.amplitude is None else self.amplitude**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,13 +105,13 @@ class Covariance:
     def between(self, one: Places, other: Places) -> np.ndarray:
         """Return the covariance between two sets of places, without the nugget, shape [n, m]."""
         difference = one.xy[:, None] - other.xy
-        total = np.full(difference.shape[:2], self.constant)
+        total = np.zeros(difference.shape[:2])
         for amplitude, matrix in zip(self.amplitude, self.matrix, strict=True):
             total += amplitude * np.exp(-_scaled_distance(difference, matrix))
         if self.ccd.any():
             for variance, term in zip(self.ccd, ccd_terms(one, other), strict=True):
                 total += variance * term
-        return total
+        return self.constant + one.amplitudes_with(other) * total
 
     def root(self, places: Places, noise: np.ndarray) -> np.ndarray:
         """Return the lower Cholesky factor of the covariance of stars, nugget and noise variances [n] included."""
@@ -106,7 +122,7 @@ class Covariance:
     def at(self, places: Places) -> np.ndarray:
         """Return the variance at places, shape [n]."""
         slope = self.ccd[1] * (places.uv**2).sum(axis=1)
-        return self.constant + self.amplitude.sum() + self.ccd[0] + self.ccd[2] + slope
+        return np.asarray(self.constant + places.squares * (self.variance + slope))
 
 
 def ccd_terms(one: Places, other: Places) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -81,6 +81,7 @@ def fit_field(
             log_likelihood(s.covariance, data.places, data.values[:, i : i + 1], data.noise[:, i : i + 1], fit.blocks)
             for i, s in enumerate(statistics)
         )
+    data = fit.data
     slopes, columns = fit.derivatives()
     covariance = solution.covariance.astype(np.float32)
     optics = OpticsPart(

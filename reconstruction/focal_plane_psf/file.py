@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -99,6 +99,8 @@ def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
         _image_hdu("USED", model.used.astype(np.int16)),
         _image_hdu("LEFT_OUT", np.stack([predicted.e1, predicted.e2, predicted.size], axis=1)),
     ]
+    if data.places.amplitude is not None:
+        hdus.append(_image_hdu("AMPLITUDE", data.places.amplitude, "of turbulence, over the mean over the field"))
     if model.mean_star is not None:
         hdus.append(_image_hdu("MEAN", model.mean_star))
     if model.pca is not None:
@@ -178,6 +180,8 @@ def read_model(kind: type[_Model], hdus: Iterable[fits.ImageHDU], path: Path) ->
             )
         mosaic = Mosaic(tuple(about["ccds"]), part("CENTERS"), about["half_size"], camera)
         places = _places_of(mosaic, part("POSITION"), part("STAR_CCD"))
+        if "AMPLITUDE" in extensions:
+            places = replace(places, amplitude=part("AMPLITUDE"))
         pca = None
         if "PCA" in extensions:
             pca = ResidualImages(

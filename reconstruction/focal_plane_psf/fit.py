@@ -154,7 +154,8 @@ class ExposureFit:
         threads: int | None,
         reporter: Reporter,
     ) -> None:
-        self.data, self.instrument, self.prior = data, instrument, prior
+        self.data = ShapeData(instrument.at_amplitudes(data.places, threads), data.values, data.noise)
+        self.instrument, self.prior = instrument, prior
         self.threads, self.reporter = threads, reporter
         # A wavefront that is not to change keeps its place among the parameters.
         self.sigma = np.maximum(exposure_sigma(alignment_rms), _NO_WAVEFRONT)

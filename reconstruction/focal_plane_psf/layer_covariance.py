@@ -73,7 +73,7 @@ class LayerCovariance:
             ],
             threads=1,
         )
-        return in_blocks(values, self.constant)
+        return in_blocks(values * one.amplitudes_with(other), self.constant)
 
     def root(self, places: Places, noise: np.ndarray) -> np.ndarray:
         """Return the lower Cholesky factor of the covariance of stars, nugget and noise variances [3 n] included."""
@@ -83,7 +83,8 @@ class LayerCovariance:
 
     def at(self, places: Places) -> np.ndarray:
         """Return the variance at places, shape [3 n]."""
-        return np.repeat(self.constant + self.variance, len(places))
+        about_common = self.variance[:, None] * (places.squares * np.ones(len(places)))
+        return (self.constant[:, None] + about_common).ravel()
 
 
 def root_of(matrix: np.ndarray) -> np.ndarray:

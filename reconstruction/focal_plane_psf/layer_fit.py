@@ -161,6 +161,7 @@ class LayerFit:
         extent = max(*extents, float(np.max(theory.camera.half_sizes)))
         self._lags = PolarLags.of(prior, theory.reach(extent), *_SEARCH)
         to_sky = theory.to_sky.T
+        self._amplitudes = [places[b].amplitudes_with(places[b]) for b in self.blocks]
         self._weights = [
             self._lags.interpolation(((places.xy[b][:, None] - places.xy[b]) @ to_sky).reshape(-1, 2))
             for b in self.blocks
@@ -301,7 +302,8 @@ class LayerFit:
 
         def contribution(k: int) -> tuple[float, np.ndarray, np.ndarray]:
             data, weights, m = self._data[k], self._weights[k], len(self.blocks[k])
-            matrix = in_blocks((weights @ table).T.reshape(-1, m, m), self._constant)
+            amplitudes = self._amplitudes[k]
+            matrix = in_blocks((weights @ table).T.reshape(-1, m, m) * amplitudes, self._constant)
             matrix[np.diag_indices(3 * m)] += data.noise + np.repeat(nugget, m)
             root = root_of(matrix)
             white = scipy.linalg.solve_triangular(root, data.factor, lower=True, check_finite=False)
@@ -313,7 +315,7 @@ class LayerFit:
             slope = 0.5 * (weighted @ weighted.T - inverse)
             by_block = slope.reshape(3, m, 3, m)
             # Covariances of different shapes stand in two blocks.
-            by_pair = [(1.0 if i == j else 2.0) * by_block[i, :, j].ravel() for i, j in PAIRS]
+            by_pair = [(1.0 if i == j else 2.0) * (amplitudes * by_block[i, :, j]).ravel() for i, j in PAIRS]
             by_nugget = np.diagonal(slope).reshape(3, m).sum(axis=1)
             return value, weights.T @ np.stack(by_pair, axis=1), by_nugget
 

@@ -67,6 +67,7 @@ class _Block:
     difference: np.ndarray  #: [m, m, 2], over the extent of the field
     fixed: np.ndarray  #: covariance that is not fitted, noise included, [m, m]
     products: np.ndarray  #: of the values, and their covariance due to fitted parameters, [m, m]
+    amplitudes: np.ndarray | float  #: products of those of two stars, [m, m], or 1
     terms: tuple[np.ndarray, ...]  #: of the CCDs, [m, m] each
 
 
@@ -133,9 +134,10 @@ def fit_covariance(
         products = np.outer(scaled_values, scaled_values)
         if spread is not None:
             products += spread(index) / power
-        terms = ccd_terms(block_places, block_places) if with_ccds else ()
+        amplitudes = block_places.amplitudes_with(block_places)
+        terms = tuple(amplitudes * t for t in ccd_terms(block_places, block_places)) if with_ccds else ()
         difference = (block_places.xy[:, None] - block_places.xy) / extent
-        prepared.append(_Block(difference, held, products, terms))
+        prepared.append(_Block(difference, held, products, amplitudes, terms))
     n_ccd = len(CCD_TERMS) if with_ccds else 0
     names = [
         f"{quantity} {j + 1}"
@@ -246,7 +248,7 @@ def _negative_log_likelihood(packed: np.ndarray, blocks: Sequence[_Block]) -> tu
             u = np.exp(along) * (block.difference[..., 0] + shear * block.difference[..., 1])
             v = np.exp(across) * block.difference[..., 1]
             length = np.sqrt(u * u + v * v)
-            term = np.exp(log_amplitude - length)
+            term = block.amplitudes * np.exp(log_amplitude - length)
             matrix += term
             parts.append((u, v, length, term))
         for variance, term in zip(variances[:-1], block.terms, strict=True):

@@ -348,7 +348,7 @@ class FocalPlanePsf(ModelFields, Result):
         brightest = np.argsort(self.field.data.noise[finite, 0], kind="stable")[:_PCA_STARS]
         finite = np.sort(finite[brightest])
         stamps = given.stamps[self.used][finite].astype(np.float64)
-        places, noise = self.field.data.places[finite], self.field.data.noise[finite]
+        places, noise = replace(self.field.data.places[finite], amplitude=None), self.field.data.noise[finite]
         weight = 1.0 / np.maximum(noise[:, 0], np.percentile(noise[:, 0], 10))
         mean = np.einsum("n,nyx->yx", weight / weight.sum(), stamps)
         model = replace(self, mean_star=mean, pixel_scale=given.pixel_scale)

@@ -92,17 +92,23 @@ class SpokePupil:
 
 
 def lit_fractions(
-    telescope: Telescope, direction: np.ndarray, wavelength: float, threads: int | None = None
+    telescope: Telescope,
+    direction: np.ndarray,
+    wavelength: float,
+    threads: int | None = None,
+    *,
+    rays: int | None = None,
 ) -> np.ndarray:
     """Return the parts of the area of the entrance pupil whose light passes all apertures, shape [n_star].
 
-    ``direction`` [n_star, 3] is that of the light's travel; the wavelength [m] is that in vacuum.
+    ``direction`` [n_star, 3] is that of the light's travel; the wavelength [m] is that in vacuum. Of a number of rays
+    of each star those that pass are counted; by default there are as many as make the parts good to a thousandth.
     """
     radius, obscuration = 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration
-    if has_only_annuli(telescope):
+    if rays is None and has_only_annuli(telescope):
         pupil = SpokePupil.fill(2.0 * radius, obscuration, 3 * _AREA_SPOKES, 3)
         return clear_areas(clear_edges(telescope, direction, pupil.unit, wavelength, threads)) / pupil.area
-    points = spiral_annulus(radius, obscuration, _AREA_RAYS).points
+    points = spiral_annulus(radius, obscuration, _AREA_RAYS if rays is None else rays).points
     fractions = []
     for first in range(0, len(direction), _STARS):
         some = direction[first : first + _STARS]

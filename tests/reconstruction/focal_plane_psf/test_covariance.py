@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,6 +62,17 @@ def test_at_is_the_diagonal_without_the_nugget():
     covariance, here = two_components(nugget=7.0), places(40, 4)
     np.testing.assert_allclose(covariance.at(here), np.diagonal(by_loops(covariance, here, here)), rtol=1e-13)
     np.testing.assert_allclose(covariance.at(here), np.diagonal(covariance.between(here, here)), rtol=1e-13)
+
+
+def test_amplitudes_multiply_all_but_what_stars_share():
+    covariance, plain, other = two_components(), places(30, 7), places(20, 8)
+    amplitudes = [np.random.default_rng(9).uniform(0.8, 1.6, len(p)) for p in (plain, other)]
+    here, there = (replace(p, amplitude=a) for p, a in zip((plain, other), amplitudes, strict=True))
+    about_common = by_loops(covariance, plain, other) - covariance.constant
+    expected = covariance.constant + np.outer(*amplitudes) * about_common
+    np.testing.assert_allclose(covariance.between(here, there), expected, rtol=1e-13)
+    np.testing.assert_allclose(covariance.at(here), np.diagonal(covariance.between(here, here)), rtol=1e-13)
+    np.testing.assert_array_equal(here[np.array([4, 2])].amplitude, amplitudes[0][[4, 2]])
 
 
 def test_variance_is_that_at_the_centre_of_a_ccd_about_the_mean():

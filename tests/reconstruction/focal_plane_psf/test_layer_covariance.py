@@ -1,5 +1,7 @@
 """The covariance of all shapes by the theory of layers: between places, in any frame, and in predictions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -83,6 +85,16 @@ def test_a_turned_detector_sees_turned_winds(turn, covariance, stars):
     np.testing.assert_allclose(through_frame, by_winds, atol=0.01 * covariance.variance.max())
     straight = aligned.covariance(AIR, CONSTANT, NUGGET).between(stars, stars)
     assert np.abs(through_frame - straight).max() > 0.05 * covariance.variance.max()
+
+
+def test_amplitudes_multiply_all_but_what_stars_share(covariance, stars):
+    amplitude = np.random.default_rng(9).uniform(0.8, 1.6, len(stars))
+    scaled = replace(stars, amplitude=amplitude)
+    common = np.kron(np.diag(CONSTANT), np.ones((len(stars), len(stars))))
+    expected = common + np.outer(*[np.tile(amplitude, 3)] * 2) * (covariance.between(stars, stars) - common)
+    found = covariance.between(scaled, scaled)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(np.diagonal(found), covariance.at(scaled), rtol=1e-4)
 
 
 def test_predictions_are_dense_linear_algebra_of_all_shapes(covariance, stars):

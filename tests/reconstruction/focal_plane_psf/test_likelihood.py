@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.optimize
@@ -62,6 +64,8 @@ def some_spread(n):
 @pytest.mark.parametrize("with_spread", [False, True])
 def test_gradient_is_that_of_differences(prepared, with_ccds, with_spread):
     here, noise = places(90, 1), np.random.default_rng(2).uniform(0.1, 0.4, 90)
+    if with_spread:
+        here = replace(here, amplitude=np.random.default_rng(5).uniform(0.8, 1.6, 90))
     values = np.random.default_rng(3).normal(0.0, 1.0, 90)
     function, first, args = prepared(
         here,

@@ -4,10 +4,12 @@ from numpy.polynomial.chebyshev import chebvander
 from numpy.polynomial.polynomial import polyvander2d
 
 from pachon.core.errors import DomainError
+from pachon.design.metrics.vignetting import vignetting
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.silicon import Silicon
 from pachon.models.io.prescription import load_telescope
 from pachon.reconstruction.focal_plane_psf import response
+from pachon.reconstruction.focal_plane_psf.covariance import Places
 from pachon.reconstruction.focal_plane_psf.height_series import HeightSeries, level_plane
 from pachon.reconstruction.focal_plane_psf.response import (
     NOLL,
@@ -39,6 +41,16 @@ def stars(plane, n, seed):
     rng = np.random.default_rng(seed)
     ccd = rng.integers(0, len(plane.camera), n)
     return plane.camera.centers[ccd] + (0.5 * plane.camera.shortest_side) * rng.uniform(-0.95, 0.95, (n, 2))
+
+
+def test_turbulence_is_larger_where_vignetting_takes_light(instrument):
+    xy = np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.335], [-0.25, 0.25]])
+    places = Places(xy, np.zeros(4, dtype=int), np.zeros((4, 2)))
+    amplitude = instrument.at_amplitudes(places).amplitude
+    lit = vignetting(instrument.telescope, instrument.fields(xy), 620e-9, n_pupil=20000).relative
+    # Relative to the centre of the field; a hundred rays.
+    np.testing.assert_allclose(amplitude / amplitude[0], lit**-0.425, rtol=0.015)
+    assert amplitude[0] == pytest.approx(0.99, abs=0.01)
 
 
 @pytest.mark.long
