@@ -23,6 +23,7 @@ from ...core.random_streams import stream
 from ...models.camera.camera import Camera
 from ...wavefront.atmosphere.mean_wavefront import covariance_by_wavefront
 from ...wavefront.atmosphere.moment_covariance import (
+    COARSE,
     PAIRS,
     ExposedAir,
     MomentResponse,
@@ -42,9 +43,8 @@ from .response import NOLL
 # Stars of a block of the likelihood, and most blocks: the strengths of layers are common to all.
 _BLOCK = 120
 _MOST_BLOCKS = 64
-# Rings and spokes of the theory, and sampling, while winds are searched: covariances are right within 2 %.
+# Rings and spokes of the theory while winds are searched: covariances are right within 2 %.
 _SEARCH = (12, 16)
-_COARSE = MomentSampling(near_spacing=1.4, drift=2.8, near_drift=1.0, least_delays=32)
 # The same of results: within 0.3 %.
 _RESULT = (28, 36)
 _FINE = MomentSampling(0.7, 0.35, 0.7, 0.25)
@@ -152,7 +152,7 @@ class LayerFit:
     def __init__(self, theory: LayerTheory, prior: ExposedAir, places: Places, constant: np.ndarray) -> None:
         self._theory, self._prior, self._constant = theory, prior, constant
         self._speeds = np.maximum(np.hypot(*np.array(prior.velocities).T), _LEAST_SPEED)
-        self._sampling = _COARSE._replace(wind=_FASTEST * float(self._speeds.max(initial=0.0)))
+        self._sampling = COARSE._replace(wind=_FASTEST * float(self._speeds.max(initial=0.0)))
         blocks = blocks_of(places.xy, _BLOCK)
         numbers = np.unique(np.linspace(0, len(blocks) - 1, min(len(blocks), _MOST_BLOCKS)).astype(int))
         #: Stars of each block of the likelihood.

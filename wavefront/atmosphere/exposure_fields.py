@@ -24,7 +24,7 @@ from ...core.warp_arrays import warp_array
 from ...models.zernike_polynomials import noll_to_nm
 from .field_kernels import add_wavefronts, factor_spectra, pairs, read_splines, spread_over_grid, zernikes
 from .mean_wavefront import mean_wavefront_covariance, radial_transform
-from .moment_covariance import ExposedAir, MomentResponse, as_matrices, as_pairs, moment_covariance
+from .moment_covariance import COARSE, ExposedAir, MomentResponse, as_matrices, as_pairs, moment_covariance
 from .polar_lags import PolarLags
 from .turbulence import path_spectrum
 
@@ -52,6 +52,10 @@ _TABLE = 8192
 _WAVEFRONT_SAMPLES = 4.5
 #: Steps of the tables up to the modes that are drawn.
 _DRAWN = round(_TABLE * _HIGHEST / _LAST)
+#: Distance of stars whose differences tell the amplitude of moments through other pupils, in angles under which the
+#: highest layer crosses the pupil, and its directions.
+_CROSSINGS = 2.0
+_DIRECTIONS = 8
 #: Factor of modes without frequency along x, and with the highest one: the inverse transform takes the mean of those at
 #: a frequency along y and at its opposite.
 _BOTH_SIGNS = np.float32(math.sqrt(2.0))
@@ -91,29 +95,38 @@ class SplineFields:
         return values
 
 
+class OpticsGain(NamedTuple):
+    """Amplitudes of moments that change over the field, by the optics of a star, over the mean over the field.
+
+    With less of the pupil fewer independent parts of the air are averaged.
+    """
+
+    share: np.ndarray  #: of the variances of p, q, s, that aberrations of the optics add, [3]
+    lit: np.ndarray  #: lit fractions, rising, [n_level]
+    amplitudes: np.ndarray  #: at these, [n_level, 3]
+
+    def factors(self, square: np.ndarray, lit: np.ndarray) -> np.ndarray:
+        """Return factors of the moments, [n, 3]; arguments as of :meth:`ExposureFields.moments_at`."""
+        by_light = np.stack([np.interp(lit, self.lit, a) for a in self.amplitudes.T], axis=1)
+        return np.sqrt(1.0 + self.share * (square[:, None] - 1.0)) * by_light
+
+
 @dataclass(frozen=True, eq=False)
 class ExposureFields:
     """Drawn fields of one exposure."""
 
     common: np.ndarray  #: moments that all stars share, p, q, s [rad^2], [3]
     moments: SplineFields  #: those that change over the field
-    #: Share of the variance of p, q, s that aberrations of the optics add, and power of the lit fraction that it goes
-    #: as, [2, 3].
-    by_optics: np.ndarray
+    by_optics: OpticsGain  #: factors of these
     common_wavefront: np.ndarray  #: Zernikes of :data:`NOLL` of the layers on the ground [m]
     wavefronts: tuple[SplineFields, ...]  #: of the others
 
-    def moments_at(self, slopes: np.ndarray) -> np.ndarray:
-        """Return p = Mxx - Myy, q = 2 Mxy, s = Mxx + Myy beyond their mean [rad^2] at field slopes [n, 2], [n, 3]."""
-        return self.common + self.moments.at(slopes)
+    def moments_at(self, slopes: np.ndarray, square: np.ndarray, lit: np.ndarray) -> np.ndarray:
+        """Return p = Mxx - Myy, q = 2 Mxy, s = Mxx + Myy beyond their mean [rad^2] at field slopes [n, 2], [n, 3].
 
-    def optics_factor(self, relative: np.ndarray) -> np.ndarray:
-        """Return factors of the moments, [n, 3], of stars with other optics than the mean over the field.
-
-        Relative to it are the square of aberrations and the lit fraction, [n, 2].
+        Stars have their squares of aberrations over the mean over the field, and lit fractions, [n] both.
         """
-        share, power = self.by_optics
-        return np.sqrt((1.0 + share * (relative[:, :1] - 1.0)) * relative[:, 1:] ** power)
+        return self.common + self.by_optics.factors(square, lit) * self.moments.at(slopes)
 
     def wavefronts_at(self, slopes: np.ndarray) -> np.ndarray:
         """Return Zernikes of :data:`NOLL` of the mean path [m] at field slopes [n, 2] [rad], [n, n_noll]."""
@@ -141,12 +154,11 @@ def draw_exposure(
 @lru_cache(maxsize=4)
 def moment_spectrum(
     air: ExposedAir, response: MomentResponse, grid: FieldGrid
-) -> tuple[tuple[tuple[np.ndarray, ...], ...], np.ndarray, np.ndarray]:
+) -> tuple[tuple[tuple[np.ndarray, ...], ...], np.ndarray, OpticsGain]:
     """Return lower Cholesky factors of the spectra of the moments on a grid, and that of what all stars share.
 
     Factors of row i are i + 1 arrays [size, size // 2 + 1] [rad^2], with the gain of splines; the other is [3, 3]. The
-    last result are the share of the variances that aberrations of the optics add, and the power of the lit fraction
-    that they go as, [2, 3].
+    last result are the amplitudes of stars of other optics.
     """
     polar_lags = PolarLags.of(air, 0.5 * math.sqrt(2.0) * grid.side)
     lags = polar_lags.lags
@@ -171,11 +183,25 @@ def moment_spectrum(
     )
     # Opposite lags have equal covariances: transforms of opposite rows are conjugates, and the spectra are real.
     spectra = scipy.fft.hfft(scipy.fft.rfft(covariance), grid.size, axis=1, overwrite_x=True)
-    all_lit = moment_covariance(air, lags[:1], response.aberration).total(response)[0, :3]
-    variance, light = np.maximum(covariances[0, :3], 1e-12 * scale), math.log(response.lit[0])
-    power = np.log(variance / np.maximum(all_lit, 1e-12 * scale)) / light if light < 0.0 else np.zeros(3)
-    by_optics = np.stack([of_orders.parts(response)[2, 0] / variance, power])
-    return _factors(spectra, scale), np.linalg.cholesky(shared + 1e-12 * scale * np.eye(3)), by_optics
+    variance = np.maximum(covariances[0, :3], 1e-12 * scale)
+    apart = min(_CROSSINGS * air.diameter / max(*air.altitudes, 1.0), 0.5 * grid.side)
+    gain = OpticsGain(of_orders.parts(response)[2, 0] / variance, *_by_light(air, response, apart))
+    return _factors(spectra, scale), np.linalg.cholesky(shared + 1e-12 * scale * np.eye(3)), gain
+
+
+def _by_light(air: ExposedAir, response: MomentResponse, apart: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return lit fractions [n_level], and amplitudes [n_level, 3] of differences of moments of stars so far apart."""
+    angle = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+    lags = np.concatenate([np.zeros((1, 2)), apart * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
+
+    def variances(lit: tuple[float, ...]) -> np.ndarray:
+        total = moment_covariance(air, lags, response.aberration, lit, sampling=COARSE).total(response)[:, :3]
+        return np.asarray(total[0] - total[1:].mean(axis=0))
+
+    levels = response.lit_levels or (response.lit,)
+    usual = variances(response.lit)
+    relative = np.stack([variances(lit) for lit in levels]) / np.where(usual > 0.0, usual, 1.0)
+    return np.array([lit[0] for lit in levels]), np.sqrt(np.where(usual > 0.0, relative, 1.0))
 
 
 def _factors(spectra: np.ndarray, scale: float) -> tuple[tuple[np.ndarray, ...], ...]:

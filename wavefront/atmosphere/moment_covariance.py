@@ -81,6 +81,8 @@ class MomentSampling(NamedTuple):
 
 #: Sampling of covariances within a per cent, half-variograms at 1' among them.
 FINE = MomentSampling()
+#: Sampling of covariances within 2 %.
+COARSE = MomentSampling(near_spacing=1.4, drift=2.8, near_drift=1.0, least_delays=32)
 
 
 class ExposedAir(NamedTuple):
@@ -138,6 +140,8 @@ class MomentResponse(NamedTuple):
     aberration: tuple[float, ...] = (0.0,)
     #: Part of the pairs of points at these distances that are both lit, of those in the annular pupil.
     lit: tuple[float, ...] = (1.0,)
+    #: The same of stars of about as much light, from the darkest on.
+    lit_levels: tuple[tuple[float, ...], ...] = ()
 
     @classmethod
     def of(cls, wavenumber: np.ndarray, transfer: np.ndarray, weight_rms: float) -> Self:

@@ -109,13 +109,19 @@ def lit_fractions(
         pupil = SpokePupil.fill(2.0 * radius, obscuration, 3 * _AREA_SPOKES, 3)
         return clear_areas(clear_edges(telescope, direction, pupil.unit, wavelength, threads)) / pupil.area
     points = spiral_annulus(radius, obscuration, _AREA_RAYS if rays is None else rays).points
-    fractions = []
-    for first in range(0, len(direction), _STARS):
-        some = direction[first : first + _STARS]
-        rays = launch_bundles(telescope, some, wavelength, points)
-        lit = trace(telescope, rays, threads=threads).status == RayStatus.OK
-        fractions.append(lit.reshape(len(some), -1).mean(axis=1))
-    return np.concatenate(fractions)
+    parts = (direction[first : first + _STARS] for first in range(0, len(direction), _STARS))
+    return np.concatenate([lit_points(telescope, part, wavelength, points, threads).mean(axis=1) for part in parts])
+
+
+def lit_points(
+    telescope: Telescope, direction: np.ndarray, wavelength: float, points: np.ndarray, threads: int | None = None
+) -> np.ndarray:
+    """Return at which points of the entrance pupil [n_point, 2] light passes all apertures, [n_star, n_point] bool.
+
+    Other arguments are those of :func:`lit_fractions`.
+    """
+    bundles = launch_bundles(telescope, direction, wavelength, points)
+    return np.asarray(trace(telescope, bundles, threads=threads).status == RayStatus.OK).reshape(len(direction), -1)
 
 
 def clear_areas(edges: np.ndarray) -> np.ndarray:

@@ -295,8 +295,9 @@ class LongExposureRenderer(PsfRenderer):
         for first in range(0, len(stars), step):
             some = stars[first : first + step]
             optics, edges = self._near_optics(some, pupil)
-            spectrum = self._exposed_spectra(self._transform(optics, edges, some.photons, pupil), optics)
-            parts.append((spectrum, self._lit_fraction(edges), optics.reference_points))
+            lit = self._lit_fraction(edges)
+            spectrum = self._exposed_spectra(self._transform(optics, edges, some.photons, pupil), optics, lit)
+            parts.append((spectrum, lit, optics.reference_points))
         spectrum, lit, points = (np.concatenate(values) for values in zip(*parts, strict=True))
         return self._sampled(spectrum, stars.offsets, np.repeat(lit[:, None], len(self._wavelengths), axis=1), points)
 
@@ -308,8 +309,8 @@ class LongExposureRenderer(PsfRenderer):
         """Expose stars far from focus by a number of rays."""
         return MeanRaysRenderer(self._inputs, rays).expose_without_refinement(stars)
 
-    def _exposed_spectra(self, spectrum: np.ndarray, optics: PupilOptics) -> np.ndarray:
-        """Return the transfer functions of stars in one exposure; of this engine the mean ones."""
+    def _exposed_spectra(self, spectrum: np.ndarray, optics: PupilOptics, lit: np.ndarray) -> np.ndarray:
+        """Return the transfer functions of stars in one exposure, of lit fractions [n_star]; here the mean ones."""
         return spectrum
 
     def _expose_lattice(self, stars: Stars) -> ExposedStars:
@@ -355,8 +356,9 @@ class LongExposureRenderer(PsfRenderer):
             transfers = self._map(
                 partial(self._autocorrelation_transfer, lattice, rays, stars.photons), range(len(stars))
             )
-            spectra.append(self._exposed_spectra(np.stack(transfers), rays.optics))
-            lit.append(np.repeat(rays.optics.lit.mean(axis=2), len(self._wavelengths), axis=1))
+            fractions = rays.optics.lit.mean(axis=2)
+            spectra.append(self._exposed_spectra(np.stack(transfers), rays.optics, fractions[:, 0]))
+            lit.append(np.repeat(fractions, len(self._wavelengths), axis=1))
             points.append(rays.optics.reference_points)
             offsets.append(stars.offsets)
         together = (np.concatenate(values) for values in (offsets, lit, points))
@@ -394,8 +396,9 @@ class LongExposureRenderer(PsfRenderer):
         return clear_areas(edges) / self._pupil.area
 
     def _expose_spokes(self, optics: PupilOptics, edges: np.ndarray, stars: Stars, pupil: SpokePupil) -> ExposedStars:
-        spectrum = self._exposed_spectra(self._transform(optics, edges, stars.photons, pupil), optics)
-        lit_fraction = np.repeat(self._lit_fraction(edges)[:, None], len(self._wavelengths), axis=1)
+        lit = self._lit_fraction(edges)
+        spectrum = self._exposed_spectra(self._transform(optics, edges, stars.photons, pupil), optics, lit)
+        lit_fraction = np.repeat(lit[:, None], len(self._wavelengths), axis=1)
         return self._sampled(spectrum, stars.offsets, lit_fraction, optics.reference_points)
 
     def _transform(

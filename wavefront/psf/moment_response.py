@@ -36,4 +36,4 @@ def moment_response(inputs: PsfInputs, means: PupilMeans, focal_length: float, w
     mean = (turbulence * diffraction).mean(axis=0)
     spread = spread * np.exp(-0.25 * means.aberration[0] * k**2)
     response = MomentResponse.of(k, mean * pixel * spread, weight)
-    return response._replace(aberration=means.aberration, lit=means.lit)
+    return response._replace(aberration=means.aberration, lit=means.lit, lit_levels=means.lit_levels)

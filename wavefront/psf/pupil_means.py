@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple, Self
 
 import numpy as np
 
 from ...core.errors import DomainError
+from ...models.telescope import Telescope
+from ...raytrace.rays import Projection, field_direction
 from ..pupil_sampling import spiral_annulus
+from .clear_pupil import lit_points
 from .engine import PsfInputs
 
 # Points of the field and of the pupil.
@@ -15,8 +19,16 @@ _FIELDS = 12
 _POINTS = 72
 # Steps of the distance of two points of the pupil, up to its diameter.
 _STEPS = 12
-# Least lit fraction over its mean.
-_LEAST_LIT = 0.2
+# Fields at which light is looked at, to where corners of cameras reach beyond the field of view: radii over its own,
+# the largest one [rad], directions, and points of the pupil.
+_RADII = np.linspace(0.3, 1.2, 21)
+_LARGEST_RADIUS = 1.4
+_DIRECTIONS = 4
+_LIGHT_POINTS = 200
+# Lit fractions between which fields are taken together.
+_LIT_LEVELS = np.array([0.15, 0.3, 0.45, 0.6, 0.75, 0.9])
+# Pupils of less light are left out.
+_LEAST_LIT = 0.05
 
 
 class PupilMeans(NamedTuple):
@@ -26,8 +38,10 @@ class PupilMeans(NamedTuple):
     aberration: tuple[float, ...]
     #: Part of the pairs of points at these distances that are both lit, of those in the annulus.
     lit: tuple[float, ...]
-    #: Mean square of the slopes, and lit fraction, over their means over the field, as polynomials over the field:
-    #: factors of 1, x, y, x^2, xy, y^2, [6, 2].
+    #: The same of fields of about as much light, from the darkest on.
+    lit_levels: tuple[tuple[float, ...], ...]
+    #: Mean square of the slopes over its mean over the field, as a polynomial over the field: factors of 1, x, y, x^2,
+    #: xy, y^2, [6].
     over_field: np.ndarray
 
     @classmethod
@@ -44,19 +58,46 @@ class PupilMeans(NamedTuple):
         except DomainError:
             fields = np.zeros((1, 2))
             slopes, lit = _slopes(inputs, fields, pupil)
-        step = np.hypot(*(pupil[:, None] - pupil).T) * (_STEPS / telescope.pupil_diameter)
-        # A pair counts at the step before its distance and at that after it, the more the nearer.
-        near = np.maximum(1.0 - np.abs(step.ravel() - np.arange(_STEPS + 1)[:, None]), 0.0)
+        near = _steps_of_pairs(pupil, telescope.pupil_diameter)
         pairs = near @ (lit.T @ lit).ravel()
         aberration = near @ np.einsum("fpi,fqi->pq", slopes, slopes).ravel() / np.maximum(pairs, 1.0)
-        both_lit = np.maximum(pairs / (len(fields) * np.maximum(near.sum(axis=1), 1e-9)), 1e-3)
-        means = np.stack([(slopes**2).sum(axis=(1, 2)) / np.maximum(lit.sum(axis=1), 1.0), lit.mean(axis=1)], axis=1)
-        over_field = np.linalg.lstsq(_terms(fields), means / np.maximum(means.mean(axis=0), 1e-30), rcond=None)[0]
-        return cls(tuple(aberration.tolist()), tuple(both_lit.tolist()), over_field)
+        squares = (slopes**2).sum(axis=(1, 2)) / np.maximum(lit.sum(axis=1), 1.0)
+        over_field = np.linalg.lstsq(_terms(fields), squares / max(squares.mean(), 1e-30), rcond=None)[0]
+        wavelengths = np.asarray(inputs.wavelengths, dtype=np.float64)
+        levels = _lit_levels(telescope, inputs.projection, float(wavelengths[len(wavelengths) // 2]))
+        return cls(tuple(aberration.tolist()), _both_lit(lit, near), levels, over_field)
 
-    def relative(self, slopes: np.ndarray) -> np.ndarray:
-        """Return mean square and lit fraction at field slopes [n, 2] over their means over the field, [n, 2]."""
-        return np.maximum(_terms(slopes) @ self.over_field, [0.0, _LEAST_LIT])
+    def relative_square(self, slopes: np.ndarray) -> np.ndarray:
+        """Return the mean square of the slopes at field slopes [n, 2] over its mean over the field, [n]."""
+        return np.maximum(_terms(slopes) @ self.over_field, 0.0)
+
+
+def _steps_of_pairs(pupil: np.ndarray, diameter: float) -> np.ndarray:
+    """Return how much pairs of points count at each step of distance, [n_step, n_pair]: the more the nearer to it."""
+    step = np.hypot(*(pupil[:, None] - pupil).T) * (_STEPS / diameter)
+    return np.maximum(1.0 - np.abs(step.ravel() - np.arange(_STEPS + 1)[:, None]), 0.0)
+
+
+def _both_lit(lit: np.ndarray, near: np.ndarray) -> tuple[float, ...]:
+    """Return the parts of pairs at each step that are both lit, mean over fields, of what is lit [n_field, n_point]."""
+    both = near @ (lit.T @ lit).ravel() / (len(lit) * np.maximum(near.sum(axis=1), 1e-9))
+    return tuple(np.maximum(both, 1e-3).tolist())
+
+
+@lru_cache(maxsize=16)
+def _lit_levels(telescope: Telescope, projection: Projection, wavelength: float) -> tuple[tuple[float, ...], ...]:
+    """Return :attr:`PupilMeans.lit_levels` at a wavelength [m]."""
+    pupil = spiral_annulus(0.5 * telescope.pupil_diameter, telescope.pupil_obscuration, _LIGHT_POINTS).points
+    near = _steps_of_pairs(pupil, telescope.pupil_diameter)
+    angle = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    radius = np.minimum(telescope.field_radius * _RADII, _LARGEST_RADIUS)
+    directions = field_direction(*(radius[:, None, None] * unit).reshape(-1, 2).T, projection)
+    lit = lit_points(telescope, directions, wavelength, pupil, 1)
+    fraction = lit.mean(axis=1)
+    level = np.where(fraction < _LEAST_LIT, -1, np.searchsorted(_LIT_LEVELS, fraction))
+    found = [_both_lit(lit[level == k].astype(np.float64), near) for k in np.unique(level[level >= 0])]
+    return tuple(sorted(found))
 
 
 def _terms(field: np.ndarray) -> np.ndarray:

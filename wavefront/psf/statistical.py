@@ -137,12 +137,11 @@ class StatisticalRenderer(LongExposureRenderer):
         response = moment_response(self._asked, self._pupil_means, self.focal_length, MATCHED_FWHM)
         return draw_exposure(self._exposed_air, response, self._inputs.telescope.field_radius, air.seed, air.epoch)
 
-    def kernels(self, optics: PupilOptics) -> np.ndarray:
-        """Return the Gaussian kernels of stars on the sky, xx, yy, xy [rad^2], [n_star, 3]."""
+    def kernels(self, optics: PupilOptics, lit: np.ndarray) -> np.ndarray:
+        """Return the Gaussian kernels on the sky, xx, yy, xy [rad^2], [n_star, 3], of stars of lit fractions [n]."""
         direction = self._direction(optics.fields)
         slopes = direction[:, :2] / -direction[:, 2:]
-        by_optics = self.drawn.optics_factor(self._pupil_means.relative(slopes))
-        p, q, s = (self.drawn.moments_at(slopes) * by_optics).T
+        p, q, s = self.drawn.moments_at(slopes, self._pupil_means.relative_square(slopes), lit).T
         wavefront = self.drawn.wavefronts_at(slopes)
         of_mean = np.einsum("ni,kij,nj->nk", wavefront, self._mean_moments, wavefront)
         return np.stack([0.5 * (s + p), 0.5 * (s - p), 0.5 * q], axis=1) - of_mean
@@ -161,8 +160,8 @@ class StatisticalRenderer(LongExposureRenderer):
         lit = np.repeat(exposed.lit_fraction[:, :1], len(self._asked.wavelengths), axis=1)
         return exposed._replace(lit_fraction=lit)
 
-    def _exposed_spectra(self, spectrum: np.ndarray, optics: PupilOptics) -> np.ndarray:
-        xx, yy, xy = self.kernels(optics).T
+    def _exposed_spectra(self, spectrum: np.ndarray, optics: PupilOptics, lit: np.ndarray) -> np.ndarray:
+        xx, yy, xy = self.kernels(optics, lit).T
         on_sky = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
         on_detector = optics.jacobian @ on_sky @ np.swapaxes(optics.jacobian, 1, 2)
         moments = on_detector.reshape(-1, 4)[:, [0, 3, 1]] * (0.5 * (2.0 * math.pi / self.period) ** 2)

@@ -70,16 +70,25 @@ def test_half_variograms_between_samples():
 
 
 def test_stars_with_less_light_have_larger_moments():
-    """Where far pairs of points are dark variances go as a negative power of the light; where all are, as none."""
+    """Where far pairs of points are dark moments differ more from star to star; not where pairs of all lengths are.
+
+    They are those of the theory for pupils of that light alone.
+    """
     grid = FieldGrid.of(AIR, FIELD_RADIUS)
-    alike, far = ((0.8, 0.8), (0.8, 0.4, 0.1))
-    (_, _, by_alike), (_, _, by_far) = (moment_spectrum(AIR, RESPONSE._replace(lit=lit), grid) for lit in (alike, far))
-    assert by_alike[1] == pytest.approx(np.zeros(3), abs=1e-3)
-    assert np.all((by_far[1] < -0.5) & (by_far[1] > -3.0))
-    fields = ExposureFields(np.zeros(3), None, by_far, np.zeros(12), ())
-    factor = fields.optics_factor(np.array([[1.0, 1.0], [1.0, 0.9]]))
-    assert factor[0] == pytest.approx(np.ones(3))
-    assert factor[1] == pytest.approx(0.9 ** (0.5 * by_far[1]))
+    alike, far = (0.5, 0.5, 0.5), (0.7, 0.3, 0.05)
+    gain = moment_spectrum(AIR, RESPONSE._replace(lit_levels=(alike, far, (1.0,))), grid)[2]
+    assert gain.lit.tolist() == [0.5, 0.7, 1.0]
+    assert gain.amplitudes[[0, 2]] == pytest.approx(np.ones((2, 3)), abs=1e-6)
+    apart = 2.0 * AIR.diameter / max(AIR.altitudes)
+    angle = np.linspace(0.0, np.pi, 17)[:-1]
+    lags = np.concatenate([[[0.0, 0.0]], apart * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
+    of_far, usual = (moment_covariance(AIR, lags, lit=lit).total(RESPONSE)[:, :3] for lit in (far, (1.0,)))
+    ratio = (of_far[0] - of_far[1:].mean(axis=0)) / (usual[0] - usual[1:].mean(axis=0))
+    assert gain.amplitudes[1] ** 2 == pytest.approx(ratio, rel=0.03)
+    assert (ratio > 1.2).all()
+    factors = gain.factors(np.ones(3), np.array([0.7, 0.85, 0.2]))
+    assert factors[[0, 2]] == pytest.approx(gain.amplitudes[[1, 0]])
+    assert factors[1] == pytest.approx(0.5 * (gain.amplitudes[1] + 1.0))
 
 
 def test_modes_are_those_of_white_noise():
@@ -121,7 +130,7 @@ def test_mean_wavefronts_have_their_covariances(altitudes, side):
     for seed in range(3):
         ground, fields = exposure_fields._draw_wavefronts(air, grid, seed, 0)
         assert not ground.any()
-        drawn = ExposureFields(np.zeros(3), fields[0], np.zeros((2, 3)), ground, fields)
+        drawn = ExposureFields(np.zeros(3), fields[0], None, ground, fields)
         here, there = drawn.wavefronts_at(stars), drawn.wavefronts_at(stars + lag)
         covariance += np.array([here.T @ here, here.T @ there]) / (3 * len(stars) * scale)
     # 750 m of a layer, 8 m across and 50 m along the wind for each independent patch: some 4200, two standard errors,

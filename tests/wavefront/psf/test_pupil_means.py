@@ -45,7 +45,7 @@ def test_defocus(telescope):
         near = np.maximum(1.0 - np.abs(12.0 * apart - step), 0.0)
         expected = slope**2 * (near @ product) / near.sum()
         assert got.aberration[step] == pytest.approx(expected, abs=0.03 * slope**2)
-    assert got.relative(np.deg2rad([[0.0, 0.0], [1.0, -1.2]]))[:, 0] == pytest.approx([1.0, 1.0], abs=5e-3)
+    assert got.relative_square(np.deg2rad([[0.0, 0.0], [1.0, -1.2]])) == pytest.approx([1.0, 1.0], abs=5e-3)
 
 
 def test_over_the_field(telescope):
@@ -54,8 +54,8 @@ def test_over_the_field(telescope):
     got = slopes_of(telescope, 0.0, (DEFOCUS / radius, 0.0))
     assert got.aberration[0] == pytest.approx(0.25 * slopes_of(telescope, DEFOCUS).aberration[0], rel=0.1)
     places = radius * np.array([[0.0, 0.5], [0.6, 0.0], [-0.6, 0.3]])
-    one = got.relative(radius * np.array([[1.0, 0.0]]))[0, 0]
-    assert got.relative(places)[:, 0] / one == pytest.approx([0.0, 0.36, 0.36], abs=5e-3)
+    one = got.relative_square(radius * np.array([[1.0, 0.0]]))[0]
+    assert got.relative_square(places) / one == pytest.approx([0.0, 0.36, 0.36], abs=5e-3)
 
 
 def test_light_of_a_vignetted_pupil():
@@ -63,15 +63,27 @@ def test_light_of_a_vignetted_pupil():
     hsc = pachon.load_telescope("hsc")
     inputs, _ = psf_inputs(hsc, [(0.0, 0.0)], [760e-9], None, None, None, Stamps(), 1)
     got = PupilMeans.of(inputs)
-    radius = hsc.field_radius
-    relative = got.relative(radius * np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 1.0]]))[:, 1]
     assert 0.7 < got.lit[0] < 0.9
     assert got.lit[8] < 0.8 * got.lit[0]
-    assert relative[0] > relative[1] > relative[2]
+    levels = np.array(got.lit_levels)
+    assert len(levels) > 2
+    assert (np.diff(levels[:, 0]) > 0.0).all()
+    # Of the darkest pupils mostly near pairs are left.
+    assert (np.diff(levels[:, 6] / levels[:, 0]) > 0.0).all()
+
+
+def test_light_at_the_corners_of_the_camera():
+    """Of the LSST's light a third is left at 2 degrees, beyond the field of view; within it hardly any is lost."""
+    lsst = pachon.load_telescope("lsst_v3.3_r")
+    inputs, _ = psf_inputs(lsst, [(0.0, 0.0)], [620e-9], None, None, None, Stamps(), 1)
+    levels = np.array(PupilMeans.of(inputs).lit_levels)
+    assert levels[0, 0] < 0.35
+    assert levels[-1, 0] > 0.95
 
 
 def test_optics_without_aberrations(telescope):
     got = slopes_of(telescope, 0.0)
     assert min(got.lit[:6]) > 0.95
     assert got.aberration == pytest.approx(np.zeros(13), abs=1e-16)
-    assert np.isfinite(got.relative(np.zeros((1, 2)))).all()
+    assert np.isfinite(got.relative_square(np.zeros((1, 2)))).all()
+    assert len(got.lit_levels) == 1

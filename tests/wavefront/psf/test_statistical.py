@@ -62,7 +62,7 @@ def test_an_exposure_of_ideal_optics_is_the_long_one_under_its_kernel(lsst):
     inputs, _ = psf_inputs(ideal, FIELDS, WAVE, None, air, None, stamps, 1)
     renderer = psf_engine("statistical").renderer(inputs)
     slopes = np.tan(FIELDS)
-    p, q, s = renderer.drawn.moments_at(slopes).T
+    p, q, s = renderer.drawn.moments_at(slopes, *np.ones((2, len(slopes)))).T
     k = 2 * np.pi * np.fft.fftfreq(61, scale)
     kx, ky = np.meshgrid(k, k)
     left = []
