@@ -92,8 +92,8 @@ def _lit_levels(telescope: Telescope, projection: Projection, wavelength: float)
     angle = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     radius = np.minimum(telescope.field_radius * _RADII, _LARGEST_RADIUS)
-    directions = field_direction(*(radius[:, None, None] * unit).reshape(-1, 2).T, projection)
-    lit = lit_points(telescope, directions, wavelength, pupil, 1)
+    x, y = (radius[:, None, None] * unit).reshape(-1, 2).T
+    lit = lit_points(telescope, field_direction(x, y, projection), wavelength, pupil, 1)
     fraction = lit.mean(axis=1)
     level = np.where(fraction < _LEAST_LIT, -1, np.searchsorted(_LIT_LEVELS, fraction))
     found = [_both_lit(lit[level == k].astype(np.float64), near) for k in np.unique(level[level >= 0])]
