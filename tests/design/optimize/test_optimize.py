@@ -283,3 +283,13 @@ def test_a_step_to_where_derivatives_end_is_made_shorter():
     assert LeastSquares().resume(BrokenProblem(1.5), box, start, effect) == pytest.approx([1.0])
     with pytest.raises(DomainError, match=r"no derivatives on the way of S1.conic: expected bounds"):
         LeastSquares().resume(BrokenProblem(-1.0), box, start, effect)
+
+
+def test_a_random_start_without_derivatives_is_left_out():
+    """Only the telescope as it is has derivatives; of the random starts most are beyond."""
+    problem = BrokenProblem(1.5)
+    parameter = SimpleNamespace(kind="shape", name="conic")
+    problem.variables = [SimpleNamespace(address="S1.conic", parameters=(parameter,), solver_start=10.0)]
+    box, start, effect = (np.array([-np.inf]), np.array([np.inf])), np.zeros(1), np.ones(1)
+    found = LeastSquares(restarts=5, spread=1.0).solve(problem, box, (), problem.residuals(start), effect)
+    assert found.changes == pytest.approx([1.0])
