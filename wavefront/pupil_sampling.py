@@ -20,7 +20,7 @@ from ..models.telescope import Telescope
 
 SamplingName = Literal["gauss", "rings", "spiral", "square"]
 #: Default ``n_pupil``: points along the radius (gauss, rings), in all (spiral) or along the diameter (square).
-_DEFAULT_N_PUPIL: dict[SamplingName, int] = {"gauss": 20, "rings": 24, "spiral": 2000, "square": 64}
+DEFAULT_N_PUPIL: dict[SamplingName, int] = {"gauss": 20, "rings": 24, "spiral": 2000, "square": 64}
 
 
 @check_arguments
@@ -149,7 +149,7 @@ def pupil_sampling(
     if isinstance(sampling, PupilSampling):
         return sampling
     radius, obscuration = 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration
-    default = _DEFAULT_N_PUPIL[sampling]
+    default = DEFAULT_N_PUPIL[sampling]
     # On a spiral the number of points, else of those along a radius or side.
     limit = MOST if sampling == "spiral" else math.isqrt(MOST)
     n = require_count(default if n_pupil is None else n_pupil, "n_pupil", 1, limit)

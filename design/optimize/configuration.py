@@ -14,7 +14,7 @@ from ...core.errors import ConfigError, DomainError
 from ...models.parameters.parameters import resolved
 from ...models.telescope import Telescope
 from ...raytrace.rays import Projection
-from ...wavefront.pupil_sampling import PupilSampling, SamplingName
+from ...wavefront.pupil_sampling import DEFAULT_N_PUPIL, PupilSampling, SamplingName
 from .merit import Beams
 from .operand import Operand
 
@@ -57,8 +57,15 @@ class DesignConfiguration:
                 f"weight of {self.telescope.name} = {self.weight!r}: expected a positive number of a configuration"
             )
 
-    def beams(self, telescope: Telescope, threads: int | None) -> Beams:
-        """Return the rays of the configuration through a telescope."""
+    def beams(self, telescope: Telescope, threads: int | None, *, dense: bool = False) -> Beams:
+        """Return the rays of the configuration through a telescope.
+
+        Where their number is not stated, `dense` ones are those of analyses: the few rings that suffice for a solver
+        have the light at cut edges of the pupil to some per cent.
+        """
+        count = self.n_pupil
+        if dense and count is None and self.sampling == "gauss":
+            count = DEFAULT_N_PUPIL[self.sampling]
         return Beams.of(
             telescope,
             self.fields,
@@ -66,7 +73,7 @@ class DesignConfiguration:
             field_weights=self.field_weights,
             wavelength_weights=self.wavelength_weights,
             sampling=self.sampling,
-            n_pupil=self.n_pupil,
+            n_pupil=count,
             projection=self.projection,
             threads=threads,
         )

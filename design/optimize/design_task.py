@@ -62,17 +62,18 @@ class DesignTask:
             states.append(DesignState(start, beams, self.function.of(lens, beams), bound, weight))
         return tuple(states)
 
-    def measured(self, telescopes: Sequence[Telescope], *, filled: bool) -> float:
+    def measured(self, telescopes: Sequence[Telescope], *, filled: bool, dense: bool = False) -> float:
         """Return the rms merit [m] of telescopes as they stand, of the light that arrives in each.
 
-        With `filled` rays fill the stop; else they are those that the design data of the telescopes state. NaN without
-        light. The spots are those of :func:`~pachon.design.metrics.spots.spots`.
+        With `filled` rays fill the stop; else they are those that the design data of the telescopes state. They are
+        those of the solver or, with `dense` and a merit that takes them, those of analyses where their number is not
+        stated: spots are those of :func:`~pachon.design.metrics.spots.spots`. NaN without light.
         """
-        squares = []
+        squares, dense = [], dense and not self.function.of_one_telescope
         for configuration, telescope in zip(self.configured, telescopes, strict=True):
             lens = following_stop(telescope) if filled else telescope
             try:
-                squares.append(self.function.rms(lens, configuration.beams(lens, self.threads)) ** 2)
+                squares.append(self.function.rms(lens, configuration.beams(lens, self.threads, dense=dense)) ** 2)
             except PachonError:
                 return np.nan
         return float(np.sqrt(self.weights @ np.array(squares)))

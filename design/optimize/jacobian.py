@@ -205,11 +205,11 @@ class ParameterColumns:
     ) -> np.ndarray:
         """Return the size of the terms of the derivatives, rms over rays and outputs, shape [n_parameter].
 
-        A derivative far below it is rounding, as the terms cancel.
+        A derivative far below it is rounding, as the terms cancel. Rays that miss a surface do not count.
         """
         terms = np.abs(self.adjoints(forward, gradient, threads=threads)).transpose(0, 2, 1)
         terms = terms @ np.abs(self.weights_at(forward.wavelength))
-        return np.sqrt(np.mean(terms**2, axis=(0, 1)))
+        return np.sqrt(np.mean(terms[:, np.isfinite(terms).all(axis=(0, 2))] ** 2, axis=(0, 1)))
 
     def derivatives(self, forward: ForwardPass, gradient: OutputGradient, *, threads: int | None = None) -> np.ndarray:
         """Return the derivatives of every output and ray with respect to each parameter, [n_output, n, n_parameter]."""

@@ -123,7 +123,10 @@ def optimize(
     beams = [state.beams for state in end.problem.states]
     started = tuple(configuration.telescope for configuration in task.configured)
     remeasured = np.array(
-        [[task.measured(lenses, filled=filled) for filled in (True, False)] for lenses in (started, end.telescopes)]
+        [
+            [task.measured(lenses, filled=filled, dense=True) for filled in (True, False)]
+            for lenses in (started, end.telescopes)
+        ]
     )
     return Optimum(
         telescopes=end.telescopes,

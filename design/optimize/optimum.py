@@ -103,7 +103,8 @@ class Optimum(Result):
         "spots" or "wavefront".
     merits : ndarray, shape [2]
         Rms of the merit alone [m], without operands, before and after: measured on the telescopes as they are saved,
-        of the light that arrives in each, with rays that fill the stop. Spots are those of :func:`pachon.spots`.
+        of the light that arrives in each, with rays that fill the stop. Spots are those of :func:`pachon.spots`, of
+        as many rays as it takes, or as are stated.
     remeasured : ndarray, shape [2, 2]
         The same, and behind it that with rays as the design data state them; NaN where no light arrives.
     history : ndarray, shape [n_step + 1]

@@ -24,6 +24,8 @@ from .operand import GoalOperand, angles_of, direction_of, operand_kind, wavelen
 
 #: Points across the pupil for the modulation transfer.
 _ACROSS = 32
+#: The same for the light that apertures take.
+_FINE = 96
 
 
 class RayAtSurface(NamedTuple):
@@ -258,7 +260,7 @@ class WavefrontMtf(GoalOperand):
     The transfer function is the mean of ``exp(i k dW)`` over the overlap of the pupil with itself, shifted by the
     wavelength times the frequency, ``dW`` the difference of the wavefront between both. Here it is the overlap times
     ``exp(-k^2 var(dW) / 2)``, equal to second order in the wavefront. It falls steadily with the aberration, where the
-    true one oscillates.
+    true one oscillates. The overlap is that of the light that arrives in the telescope at the start.
 
     Parameters
     ----------
@@ -279,6 +281,7 @@ class WavefrontMtf(GoalOperand):
     angle: float = 0.5 * math.pi
     wavelength: float | None = None
     shear: tuple[float, float] | None = dataclasses.field(default=None, repr=False, compare=False, kw_only=True)
+    overlap: float | None = dataclasses.field(default=None, repr=False, compare=False, kw_only=True)
 
     def bound(self, telescope: Telescope) -> Self:  # noqa: D102
         wavelength = wavelength_of(self.wavelength, telescope)
@@ -286,28 +289,50 @@ class WavefrontMtf(GoalOperand):
         # Exit direction cosines of pupil point p are those of the chief ray minus J^-T p.
         along = self.frequency * wavelength * np.array([math.cos(self.angle), math.sin(self.angle)])
         x, y = (float(v) for v in jacobian.T @ along)
-        return replace(self, shear=(x, y))
+        return replace(self, shear=(x, y), overlap=self._lit_overlap(telescope, np.array([x, y])))
 
     def measure(self, telescope: Telescope) -> float:  # noqa: D102
-        shear = np.array(self.shear or self.bound(telescope).shear)
-        outer = 0.5 * telescope.pupil_diameter
-        inner, distance = outer * telescope.pupil_obscuration, float(np.hypot(*shear))
-        limit = _overlap(outer, outer, distance) - 2.0 * _overlap(outer, inner, distance)
-        limit = (limit + _overlap(inner, inner, distance)) / (math.pi * (outer**2 - inner**2))
-        if limit <= 0.0:
-            raise DomainError(f"operand {self.label}: expected a frequency below the cut-off of diffraction")
-        across = outer * (2.0 * (np.arange(_ACROSS) + 0.5) / _ACROSS - 1.0)
-        points = np.stack([v.ravel() for v in np.meshgrid(across, across)])
-        sheared_pupils = [points + sign * 0.5 * shear[:, None] for sign in (1.0, -1.0)]
-        inside = np.all([(inner <= np.hypot(*p)) & (np.hypot(*p) <= outer) for p in sheared_pupils], axis=0)
-        wavelength = wavelength_of(self.wavelength, telescope)
-        pupil = np.concatenate([p[:, inside] for p in sheared_pupils], axis=1)
-        opd = wavefront_opd(telescope, self.field, wavelength, (pupil[0], pupil[1]), threads=1).value
-        change = np.subtract(*opd.reshape(2, -1))
+        if self.shear is None or self.overlap is None:
+            return self.bound(telescope).measure(telescope)
+        opd = self._wavefronts(telescope, _pupil_pairs(telescope, np.array(self.shear), _ACROSS))
+        change = np.subtract(*opd)
         change = change[np.isfinite(change)]
         if not len(change):
             raise DomainError(f"operand {self.label}, {field_label(np.array(self.field))}: no light passes")
-        return limit * math.exp(-0.5 * (2.0 * math.pi / wavelength) ** 2 * float(change.var()))
+        wavelength = wavelength_of(self.wavelength, telescope)
+        return self.overlap * math.exp(-0.5 * (2.0 * math.pi / wavelength) ** 2 * float(change.var()))
+
+    def _wavefronts(self, telescope: Telescope, points: np.ndarray) -> np.ndarray:
+        """Return the wavefronts [m] at points of two pupils [m], shape [2, 2, n] to [2, n]; NaN where not lit."""
+        x, y = np.moveaxis(points, 1, 0).reshape(2, -1)
+        wavelength = wavelength_of(self.wavelength, telescope)
+        return wavefront_opd(telescope, self.field, wavelength, (x, y), threads=1).value.reshape(2, -1)
+
+    def _lit_overlap(self, telescope: Telescope, shear: np.ndarray) -> float:
+        """Return the overlap of the lit pupil with itself, shifted by `shear` [m], over its area."""
+        outer = 0.5 * telescope.pupil_diameter
+        inner, distance = outer * telescope.pupil_obscuration, float(np.hypot(*shear))
+        annuli = _overlap(outer, outer, distance) - 2.0 * _overlap(outer, inner, distance)
+        annuli = (annuli + _overlap(inner, inner, distance)) / (math.pi * (outer**2 - inner**2))
+        if annuli <= 0.0:
+            raise DomainError(f"operand {self.label}: expected a frequency below the cut-off of diffraction")
+        # What apertures take from the annulus of the pupil, and from the overlap of two.
+        lit, both_lit = (
+            float(np.isfinite(self._wavefronts(telescope, _pupil_pairs(telescope, shift, _FINE))).all(axis=0).mean())
+            for shift in (np.zeros(2), shear)
+        )
+        return annuli * both_lit / lit if lit else annuli
+
+
+def _pupil_pairs(telescope: Telescope, shear: np.ndarray, across: int) -> np.ndarray:
+    """Return points that lie in both of two pupils apart by `shear` [m], in the frame of each [m], shape [2, 2, n]."""
+    outer = 0.5 * telescope.pupil_diameter
+    inner = outer * telescope.pupil_obscuration
+    line = outer * (2.0 * (np.arange(across) + 0.5) / across - 1.0)
+    points = np.stack([v.ravel() for v in np.meshgrid(line, line)])
+    pupils = np.stack([points + sign * 0.5 * shear[:, None] for sign in (1.0, -1.0)])
+    radii = np.hypot(pupils[:, 0], pupils[:, 1])
+    return pupils[:, :, ((inner <= radii) & (radii <= outer)).all(axis=0)]
 
 
 def _overlap(first: float, second: float, distance: float) -> float:

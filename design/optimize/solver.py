@@ -99,9 +99,13 @@ class LeastSquares:
         for start in random_starts(problem.variables, bounded, box, self.spread, self.seed, self.restarts):
             start_residuals = problem.residuals(start)
             if np.isfinite(start_residuals).all():
-                end, end_history = self._descend(problem, box, start, start_residuals, scale)
+                try:
+                    end, end_history = self._descend(problem, box, start, start_residuals, scale)
+                except DomainError:
+                    # Rays of a random telescope may be lost where derivatives are taken.
+                    continue
                 if end.cost < best.cost:
-                    best, history = end, end_history
+                    best, history = end, [history[0], *end_history]
         return Solution(best.x * scale, history, str(best.message))
 
     def resume(

@@ -22,7 +22,7 @@ reference_sphere_radius: 2.0
 field: {radius: 0.2, limit: 0.5}
 wavelengths: {range: [0.3, 1.0], default: 0.55}
 surfaces:
-  - {name: M1, type: mirror, shape: paraboloid, z: 0.0, radius: 4.0, circle: 0.26}
+  - {name: M1, type: mirror, shape: paraboloid, z: 0.0, radius: 4.0, annulus: [0.05, 0.26]}
   - {name: Detector, type: detector, shape: plane, z: 2.0, circle: 0.02}
 """)
 telescope = pachon.load_telescope("newton.yaml")

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from ...core.errors import PrescriptionError
+from ..central_obscuration import central_obscuration
 from ..links import Pickup, Solve
 from ..media.fitted import fitted_dispersion
 from ..media.medium import Medium
@@ -18,6 +19,8 @@ from .lens.source import Findings
 
 #: Relative difference from a pickup that rounding in files makes.
 _ROUNDING = 1e-6
+#: Obscuration beyond the shadow of the apertures that rounding in prescriptions makes.
+_SHADOW = 1e-3
 #: Factors of the shortest and the longest wavelength of a telescope between which a fitted formula holds.
 _MARGIN = (0.85, 1.2)
 #: Deviation of a fitted index that needs no leniency: a fiftieth of the precision of catalogues.
@@ -56,6 +59,14 @@ def report_pupil_plane(telescope: Telescope, findings: Findings, *, own_stop: bo
     problem = f"stop = {data.stop}, aiming = {data.aiming}: the stop and the stated aperture do not make the pupil"
     instead = "a plane in front carries the stop" + (", and rays are not aimed" if data.aiming != "off" else "")
     findings.note(PrescriptionError(problem), instead)
+
+
+def report_obscuration(telescope: Telescope, findings: Findings, file: str) -> None:
+    """Warn of an obscuration of the pupil that no aperture makes, which `file`, as its name is said, cannot hold."""
+    stated, shadow = telescope.pupil_obscuration, central_obscuration(replace(telescope, pupil_obscuration=0.0))
+    if stated > shadow + _SHADOW:
+        problem = f"pupil.obscuration = {stated:.6g}: {file} has no place for it"
+        findings.note(PrescriptionError(problem), f"read back it is that of the apertures, {shadow:.6g}")
 
 
 def with_formulas(telescope: Telescope, written: Callable[[Medium], object], findings: Findings) -> Telescope:

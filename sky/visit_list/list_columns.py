@@ -14,6 +14,11 @@ from ...core.units import ARCSEC
 from .list_table import ListTable
 from .names import QUANTITIES
 
+#: Columns by which databases of OpSim 3 are known, whose angles are in radians.
+_OPSIM_3 = {"expmjd", "obshistid"}
+#: Of angles in radians with few digits.
+_ROUNDING = 0.01
+
 
 @dataclass
 class ListColumns:
@@ -24,6 +29,7 @@ class ListColumns:
     kind: str  #: of the file, as :class:`ListTable` has it
     all_names: tuple[str, ...]  #: of the columns of the file
     remarks: list[str] = field(default_factory=list)
+    assumption: str = ""  #: on units, for messages of wrong values
 
     @classmethod
     def of(cls, table: ListTable, where: str | None) -> ListColumns:
@@ -37,10 +43,16 @@ class ListColumns:
         if not source:
             columns.require("ra")
         selected = table.select(list(dict.fromkeys(source.values())), where)
-        # OpSim 3 has its angles in radians.
-        in_radians = table.kind == "sqlite" and {"expmjd", "obshistid"} <= set(table.columns)
-        if in_radians:
+        in_radians = table.kind == "sqlite" and set(table.columns) >= _OPSIM_3
+        if in_radians and _has_degrees(table, source):
+            in_radians = False
+            columns.remarks.append("angles are in degrees, although the columns are those of OpSim 3")
+        elif in_radians:
             columns.remarks.append("angles are in radians, as in databases of OpSim 3")
+            columns.assumption = (
+                "angles are taken in radians, as of OpSim 3, which has expMJD and obsHistID; if they are in degrees, "
+                "rename expMJD to observationStartMJD"
+            )
         for key, name in source.items():
             unit = "rad" if in_radians and QUANTITIES[key].unit == "deg" else QUANTITIES[key].unit
             values = selected[name]
@@ -53,7 +65,7 @@ class ListColumns:
     def rows(self, mask: np.ndarray) -> ListColumns:
         """Return the rows of a mask."""
         values = {key: column[mask] for key, column in self.values.items()}
-        return ListColumns(values, self.source, self.kind, self.all_names, self.remarks)
+        return ListColumns(values, self.source, self.kind, self.all_names, self.remarks, self.assumption)
 
     def require(self, *keys: str) -> str:
         """Return the first of some quantities that the list has; ProductError names the columns looked for."""
@@ -99,9 +111,21 @@ class ListColumns:
         """Return the error of the first of some visits."""
         number = self.values["visit"][wrong[0]] if "visit" in self.values else wrong[0] + 1
         extent = f"{len(wrong)} of {len(self)} visits are so; " if len(wrong) > 1 else ""
+        assumption = f"; {self.assumption}" if self.assumption else ""
         return DomainError(
-            f"visit {number}: {value}: expected {expected}; {extent}leave them out by a condition (where)", key=name
+            f"visit {number}: {value}: expected {expected}; {extent}leave them out by a condition (where){assumption}",
+            key=name,
         )
+
+
+def _has_degrees(table: ListTable, source: dict[str, str]) -> bool:
+    """Return whether an angle of any row is too large for radians, and possible in degrees."""
+    largest = {"ra": (2.0 * np.pi, 360.0), "dec": (0.5 * np.pi, 90.0), "altitude": (0.5 * np.pi, 90.0)}
+    return any(
+        table.has_row(source[key], radians + _ROUNDING, degrees)
+        for key, (radians, degrees) in largest.items()
+        if key in source
+    )
 
 
 def _in_si(values: np.ndarray, file_unit: Any, unit: str, name: str) -> np.ndarray:

@@ -83,6 +83,17 @@ class ListTable:
             return {column: np.zeros(0) for column in columns}
         return {name: _joined([chunk[i] for chunk in chunks]) for i, name in enumerate(columns)}
 
+    def has_row(self, column: str, above: float, limit: float) -> bool:
+        """Return whether the size of a number of a column is in an interval; ProductError if it is unreadable."""
+        query = (
+            f"SELECT EXISTS (SELECT 1 FROM \"{self.name}\" WHERE typeof(\"{column}\") IN ('integer', 'real') "
+            f'AND abs("{column}") > ? AND abs("{column}") <= ?)'
+        )
+        try:
+            return bool(self.connection.execute(query, (above, limit)).fetchone()[0])
+        except sqlite3.Error as error:
+            raise ProductError(f"cannot be read ({error})") from None
+
 
 @contextmanager
 def open_list(path: Path) -> Iterator[ListTable]:

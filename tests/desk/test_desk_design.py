@@ -72,6 +72,7 @@ def test_an_optimisation_finds_the_misalignment_that_optimize_finds():
         ["M2.dz", "M2.dx"],
         fields=BENCH.spot_fields,
         wavelengths=MOVED.wavelength_nm * 1e-9,
+        n_pupil=6,
     )
     assert better.before_um == pytest.approx(1e6 * expected.merits[0], rel=1e-9)
     # Some steps go most of the way; the rest is that of the next ones.

@@ -26,7 +26,7 @@ from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope
 from ..glass_catalogue import CATALOGUES, GlassCatalogue
 from ..glass_search import find_glass, maker_of, makers_in
-from ..writable import report_pupil_plane, report_unheld, require_met, require_sequential
+from ..writable import report_obscuration, report_pupil_plane, report_unheld, require_met, require_sequential
 from .description import PUPIL_PLANE, LensSurface
 from .frame import HALF_TURN, rotated_aperture, rotated_shape
 from .source import Findings, Source
@@ -95,6 +95,7 @@ class LensSequence:
             report_unheld(t, (*data.pickups, *data.solves), file, lenient=lenient, others=flags)
             own_stop = stop_makes_pupil(t) or (aimed != "off" and stop_states_rays(t))
             report_pupil_plane(t, findings, own_stop=own_stop, aimed=aimed)
+            report_obscuration(t, findings, file)
             if own_stop and data.aiming != aimed:
                 problem = f"aiming = {data.aiming}: {file} does not state how rays are aimed"
                 findings.note(PrescriptionError(problem), f"read back it is {aimed}")

@@ -24,7 +24,7 @@ from ..lens.description import LensSurface
 from ..lens.sequence import lens_surfaces, stated_wavelengths
 from ..lens.source import Findings
 from ..lens.text import scaled
-from ..writable import report_pupil_plane, report_unheld, require_sequential, with_formulas
+from ..writable import report_obscuration, report_pupil_plane, report_unheld, require_sequential, with_formulas
 from .gratings import MODEL, grating_items
 from .media import material_items
 from .reader import APERTURES, FIELD_TYPES, THIN_LENS_MODEL
@@ -63,6 +63,7 @@ def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str
         for surface in lens_surfaces(t, stop):
             with error_context(subject=f"surface {surface.name}"):
                 surfaces.append(_surface_items(surface, first))
+        report_obscuration(t, findings, "a file of optiland")
     heights = [s["geometry"]["cs"]["z"] for s in surfaces]
     for items, height, next_height in zip(surfaces[1:], heights[1:], [*heights[2:], heights[-1]], strict=True):
         items["thickness"] = (next_height - height) / MM

@@ -28,7 +28,14 @@ from ..lens.description import PUPIL_PLANE, LensSurface
 from ..lens.sequence import lens_surfaces, stated_wavelengths
 from ..lens.source import Findings
 from ..lens.text import number_text, scaled
-from ..writable import report_pupil_plane, report_unheld, require_met, require_sequential, with_formulas
+from ..writable import (
+    report_obscuration,
+    report_pupil_plane,
+    report_unheld,
+    require_met,
+    require_sequential,
+    with_formulas,
+)
 from .apertures import aperture_lines
 from .gratings import grating_lines, with_grooves_along_x
 from .links import add_link_lines
@@ -117,6 +124,7 @@ def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[
     left_out = add_link_lines(t, numbered, unit)
     with error_context(subject=t.name):
         report_unheld(t, left_out, "a Zemax file", lenient=lenient)
+        report_obscuration(t, findings, "a Zemax file")
     for number, block in enumerate(blocks):
         lines += [f"SURF {number}", *(f"  {line}" for line in block)]
     return "\n".join(lines) + "\n", "".join(_catalogue_lines(glasses))

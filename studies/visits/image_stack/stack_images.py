@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from functools import partial
 from pathlib import Path
@@ -34,6 +35,7 @@ from ..psf_visit import (
 from .config import ImageStackConfig, load_image_stack_configuration
 from .image_stack import SETTINGS_NAME, ImageStack, tile_side
 from .resample import add_resampled
+from .tile_light import TileLight
 from .tiles import BYTES, STACK_MASK_BITS, Tile, TileSums, window_on
 from .visit_image import Sky, visit_image
 from .visit_wcs import VisitWcs
@@ -106,7 +108,7 @@ def stack_images(
                 total = sums[tile]
                 total.add(tile_sums)
                 if total.visits in stack.visits.kept:
-                    _write_image(stack, tile, total)
+                    _write_image(stack, tile, total, threads)
                 # Written last, so that all visits that it counts are in the image.
                 total.write(stack.sums_path(tile), stack.stamp)
     return stack
@@ -122,7 +124,12 @@ def draw_visit(
     visit, experiment, wcs, tiles = job
     reporter = reporter or Reporter(quiet=True)
     reporter.line(f"{visit.label}, {visit}")
-    touched = {name: window_on(tiles, stack.frame, ccd_wcs) for name, ccd_wcs in wcs.items()}
+    # Noise depends on the part of a CCD that is drawn: it is that of all tiles, whichever are due.
+    touched = {
+        name: window_on(stack.tiles, stack.frame, ccd_wcs)
+        for name, ccd_wcs in wcs.items()
+        if window_on(tiles, stack.frame, ccd_wcs) is not None
+    }
     windows = {name: window for name, window in touched.items() if window is not None}
     exposure, sums = stack.exposure(), {tile: TileSums.empty(tile.side) for tile in tiles}
     bar = reporter.stage(f"images of {counted(len(windows), 'CCD')}", total=len(windows))
@@ -140,9 +147,11 @@ def draw_visit(
     return sums
 
 
-def _write_image(stack: ImageStack, tile: Tile, sums: TileSums) -> None:
+def _write_image(stack: ImageStack, tile: Tile, sums: TileSums, threads: int | None) -> None:
     """Write the image of a tile with the table of its stars and galaxies."""
     wcs, exposure = tile.wcs(stack.frame), stack.exposure(sums.visits)
+    light = TileLight.of(stack.experiment, stack.frame, tile, stack.plan[: sums.visits], threads)
+    zero_point = exposure.zero_point + 2.5 * math.log10(light.in_middle)
     header = wcs.to_header()
     for key, value, comment in (
         ("BUNIT", "adu", "electrons of all visits together"),
@@ -151,7 +160,7 @@ def _write_image(stack: ImageStack, tile: Tile, sums: TileSums) -> None:
         ("EXPTIME", exposure.total_time, "[s] all visits together"),
         ("NEXP", sums.visits, "number of visits"),
         ("GAIN", exposure.gain, "[electron/adu]"),
-        ("ZEROPNT", round(exposure.zero_point, 6), "[mag] AB magnitude of 1 adu in EXPTIME"),
+        ("ZEROPNT", round(zero_point, 6), "[mag] AB, of 1 adu in EXPTIME, in the middle"),
         ("SKY", round(exposure.background, 6), "[adu] background: sky and dark current"),
         ("SKYSUB", True, "whether the background is subtracted"),
         ("NOISE", exposure.noise, "whether there is noise"),
@@ -159,7 +168,7 @@ def _write_image(stack: ImageStack, tile: Tile, sums: TileSums) -> None:
     ):
         header[key] = (value, comment)
     image, variance, mask = sums.stacked()
-    objects = _truth_table(stack, tile, wcs, exposure)
+    objects = _truth_table(stack, tile, wcs, exposure, light)
     name = f"tile {tile.name}"
     stacked_image = CcdImage(name, image, variance, mask, header, objects, stack.stamp, STACK_MASK_BITS)
     stacked_image.write(stack.path(sums.visits, tile))
@@ -172,8 +181,10 @@ def galaxies_on(sky: Sky, tile: Tile, wcs: CcdWcs) -> Any:
     return galaxies.take(np.flatnonzero(tile.inside.contains(pixels)))
 
 
-def _truth_table(stack: ImageStack, tile: Tile, wcs: CcdWcs, exposure: Exposure) -> dict[str, np.ndarray]:
-    """Return the table of the stars and galaxies of a tile; electrons are those of an unvignetted telescope."""
+def _truth_table(
+    stack: ImageStack, tile: Tile, wcs: CcdWcs, exposure: Exposure, light: TileLight
+) -> dict[str, np.ndarray]:
+    """Return the table of the stars and galaxies of a tile."""
     points = stack.sky.points
     galaxies = galaxies_on(stack.sky, tile, wcs)
     stars = points.sky[points.star]
@@ -192,7 +203,7 @@ def _truth_table(stack: ImageStack, tile: Tile, wcs: CcdWcs, exposure: Exposure)
     ):
         pixels = wcs.to_pixel(sky)
         in_tile = tile.inside.contains(pixels)
-        columns = {"PIXEL": pixels, "SKY": sky, "MAG": mag, "FLUX": exposure.electrons(mag)}
+        columns = {"PIXEL": pixels, "SKY": sky, "MAG": mag, "FLUX": exposure.electrons(mag) * light.at(pixels)}
         columns |= {"STAR": np.full(len(sky), star), "RADIUS": radius, "E1": e1, "E2": e2}
         tables.append({key: values[in_tile] for key, values in columns.items()})
     return object_columns({key: np.concatenate([table[key] for table in tables]) for key in tables[0]}, wcs)

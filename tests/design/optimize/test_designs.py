@@ -252,6 +252,8 @@ def test_restarts_keep_the_best_and_depend_on_the_seed_alone(doublet):
     found, again = (optimize(doublet, ACHROMAT, solver=solver, **how) for _ in range(2))
     assert np.array_equal(found.changes, again.changes)
     assert found.history[-1] <= alone.history[-1]
+    # Before the first step the telescope is as it was, whichever start leads to the end.
+    assert found.history[0] == alone.history[0]
 
 
 @pytest.mark.slow

@@ -218,6 +218,20 @@ def test_telescopes_without_design_data(tmp_path, name, ending):
     assert_same_rays(telescope, read, statuses=ending == ".seq")
 
 
+@pytest.mark.parametrize("ending", [".zmx", ".seq", ".len", ".json", ".roa"])
+def test_an_obscuration_that_no_aperture_makes_is_told(tmp_path, ending):
+    """Files of lenses have apertures alone: light fills the middle of what is read."""
+    singlet, path = lens("singlet"), tmp_path / f"lens{ending}"
+    blocked = replace(singlet, pupil_obscuration=0.4)
+    assert "pupil.obscuration = 0.4" not in warnings_of(singlet, path)
+    said = warnings_of(blocked, path)
+    assert "pupil.obscuration = 0.4: " in said
+    assert "has no place for it; read back it is that of the apertures, 0" in said
+    assert pachon.load_telescope(path).pupil_obscuration == 0.0
+    # The rim of M1 makes it.
+    assert "pupil.obscuration" not in warnings_of(pachon.load_telescope("paul_baker"), path)
+
+
 def test_text_of_a_codev_file(tmp_path):
     again(
         lens("singlet").with_design(vignetting=((0.0,) * 5, (0.0, 0.1, 0.2, 0.3, 0.0), (0.0,) * 5)), tmp_path / "a.seq"

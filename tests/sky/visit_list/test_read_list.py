@@ -156,6 +156,32 @@ def test_databases_of_opsim_3_have_radians(visits, write_database):
     same_visits(old.rows(visits.snaps == 1), one_snap)
 
 
+OLD_NAMES = {"observationId": "obsHistID", "observationStartMJD": "expMJD"}
+
+
+def test_names_of_opsim_3_with_degrees(visits, write_database):
+    """Declinations beyond pi/2 can only be degrees, in whatever row, whichever rows are taken."""
+    columns = {OLD_NAMES.get(name, name): column(name) for name in COLUMNS}
+    path = write_database("observations", columns)
+    same_visits(read_visit_list(path), visits)
+    low = {
+        "fieldRA": np.array([5.0, 53.4, 52.9, 53.2, 53]),
+        "fieldDec": np.array([-1.2, -27.5, -28.1, -27.9, 9999.0]),
+    }
+    one = read_visit_list(write_database("observations", columns | low, "low.db"), where="obsHistID = 1001")
+    np.testing.assert_allclose(np.rad2deg([one.ra[0], one.dec[0]]), [5.0, -1.2])
+    assert "degrees" in one.remarks[0]
+
+
+def test_error_of_radians_says_so(write_database):
+    """Angles that may be either are radians: what cannot be seen then says what was taken, and what to do."""
+    columns = {OLD_NAMES.get(name, name): column(name) for name in COLUMNS}
+    columns |= {"fieldRA": np.linspace(0.0, 5.0, 5), "fieldDec": np.full(5, 1.2)}
+    with pytest.raises(DomainError, match=r"angles are taken in radians, as of OpSim 3.*rename expMJD") as raised:
+        read_visit_list(write_database("observations", columns))
+    assert "\n" not in str(raised.value)
+
+
 def test_columns_of_consdb(visits, write_list):
     renamed = {
         "visit_id": column("observationId"),

@@ -15,6 +15,7 @@ from pachon.studies.visits.image_stack.config import ImageStackConfig, load_imag
 from pachon.studies.visits.image_stack.stack_images import ImageStack, stack_images
 from pachon.studies.visits.image_stack.tiles import TileSums, choose_tiles
 from pachon.studies.visits.image_stack.transfer import broadened, mean_transfer
+from pachon.studies.visits.psf_visit import visit_experiment
 
 SMALL = ImageStackConfig(faintest=21.5, side=128)
 
@@ -129,6 +130,18 @@ def test_an_interrupted_stack_ends_with_the_same_bytes(visits_folder, backwards,
     (whole / "images" / "stack_0001_tile_+00_+00.fits").unlink()
     with pytest.raises(ProductError, match=r"no image of 1 visit of tile \+00_\+00, and has gone on"):
         stack_images(whole, settings, execution=Execution(resume=True))
+
+
+@pytest.mark.long
+def test_a_tile_alone_has_the_noise_that_it_has_among_others(visits_folder):
+    """Of tiles of which one was written before an interruption, only the other is due."""
+    stack = ImageStack.of(visits_folder, SMALL.model_copy(update={"tiles": 2}))
+    ((visit, wcs),) = stack.wcs(stack.plan[:1])
+    experiment = visit_experiment(stack.experiment, visit)
+    both = module.draw_visit(stack, None, (visit, experiment, wcs, stack.tiles), 1)
+    for tile in stack.tiles:
+        alone = module.draw_visit(stack, None, (visit, experiment, wcs, [tile]), 1)
+        np.testing.assert_array_equal(alone[tile].data, both[tile].data)
 
 
 def test_images_of_several_tiles_are_found_again(visits_folder):
