@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,7 +29,8 @@ from ...models.zernike_polynomials import noll_to_nm
 from ...raytrace.rays import field_direction
 from ...wavefront.aberration import LINEAR_FRACTION, ResidualWavefront
 from ...wavefront.atmosphere.atmosphere import Atmosphere
-from ...wavefront.atmosphere.moment_covariance import MomentResponse
+from ...wavefront.atmosphere.exposure_fields import amplitudes_by_light
+from ...wavefront.atmosphere.moment_covariance import ExposedAir, MomentResponse
 from ...wavefront.chief_rays import fields_at, image_jacobians
 from ...wavefront.psf.clear_pupil import has_only_annuli, lit_fractions
 from ...wavefront.psf.engine import center_focal_length
@@ -38,7 +40,6 @@ from ...wavefront.psf.moment_response import moment_response
 from ...wavefront.psf.psf import make_psfs, psf_inputs
 from ...wavefront.psf.pupil_means import PupilMeans
 from ...wavefront.psf.stamps import Stamps
-from ...wavefront.pupil_sampling import spiral_annulus
 from .covariance import Places
 from .height_series import HeightSeries, level_plane
 
@@ -55,13 +56,8 @@ _NODES = 5
 _WAVEFRONT_STEP = 0.05e-6
 # ... and of the logarithm of the Fried parameter.
 _SEEING_STEP = 0.05
-# Variance of what turbulence adds, a mean over the pupil, over narrow angles goes as such a power of its lit part:
-# half-variograms at 2' where 79 to 20 % are lit, of five exposures of the LSST, as powers of -0.81 to -0.9.
-_LIT_POWER = -0.85
-# Rays of a star that tell the lit part within some per cent, fields of its mean, and least part over that.
+# Rays of a star that tell the lit part of its pupil within some per cent.
 _LIT_RAYS = 100
-_LIT_FIELDS = 24
-_LEAST_LIT = 0.05
 # Stars at which derivatives are computed.
 _SAMPLES = 300
 # ... fewer where they are costly.
@@ -174,13 +170,21 @@ class Instrument:
 
     def at_amplitudes(self, places: Places, threads: int | None = None) -> Places:
         """Return places with the amplitudes of turbulence there: it is larger where less of the pupil is lit."""
-        angles = [self.fields(places.xy, threads), spiral_annulus(self.telescope.field_radius, 0.0, _LIT_FIELDS).points]
+        directions = field_direction(*self.fields(places.xy, threads).T)
         wavelength = float(self.wavelengths[len(self.wavelengths) // 2])
-        lit, of_field = (
-            lit_fractions(self.telescope, field_direction(*a.T), wavelength, threads, rays=_LIT_RAYS) for a in angles
-        )
-        relative = np.maximum(lit / max(float(of_field.mean()), _LEAST_LIT), _LEAST_LIT)
-        return replace(places, amplitude=relative ** (0.5 * _LIT_POWER))
+        lit = lit_fractions(self.telescope, directions, wavelength, threads, rays=_LIT_RAYS)
+        return replace(places, amplitude=np.interp(lit, *self._amplitudes_by_light))
+
+    @cached_property
+    def _amplitudes_by_light(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lit fractions of the pupil, rising, and amplitudes there, the mean of those of three moments."""
+        telescope, own = self.telescope, self.atmosphere
+        # In winds of any exposure: they hardly matter, and are not known.
+        air = Atmosphere.from_site("cerro_pachon", seed=0, r0=own.r0, outer_scale=own.outer_scale)
+        exposed = ExposedAir.of(air, telescope.pupil_diameter, telescope.pupil_obscuration)
+        response, _ = self.moment_response(None)
+        lit, amplitudes = amplitudes_by_light(exposed, response, telescope.field_radius)
+        return lit, amplitudes.mean(axis=1)
 
     def images(
         self,

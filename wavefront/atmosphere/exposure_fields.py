@@ -184,13 +184,17 @@ def moment_spectrum(
     # Opposite lags have equal covariances: transforms of opposite rows are conjugates, and the spectra are real.
     spectra = scipy.fft.hfft(scipy.fft.rfft(covariance), grid.size, axis=1, overwrite_x=True)
     variance = np.maximum(covariances[0, :3], 1e-12 * scale)
-    apart = min(_CROSSINGS * air.diameter / max(*air.altitudes, 1.0), 0.5 * grid.side)
-    gain = OpticsGain(of_orders.parts(response)[2, 0] / variance, *_by_light(air, response, apart))
+    gain = OpticsGain(of_orders.parts(response)[2, 0] / variance, *amplitudes_by_light(air, response, 0.5 * grid.side))
     return _factors(spectra, scale), np.linalg.cholesky(shared + 1e-12 * scale * np.eye(3)), gain
 
 
-def _by_light(air: ExposedAir, response: MomentResponse, apart: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return lit fractions [n_level], and amplitudes [n_level, 3] of differences of moments of stars so far apart."""
+def amplitudes_by_light(air: ExposedAir, response: MomentResponse, most: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return lit fractions of stars [n_level], and amplitudes [n_level, 3] of the differences of their moments.
+
+    They are those of stars two crossings of the highest layer apart, at most so far [rad], over those on the mean over
+    the field. Fractions rise.
+    """
+    apart = min(_CROSSINGS * air.diameter / max(*air.altitudes, 1.0), most)
     angle = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     lags = np.concatenate([np.zeros((1, 2)), apart * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
 
