@@ -261,10 +261,10 @@ def _finished(
         flags |= DonutFlag.RIM_MOVED
     if len(finest.solution.stars[0]) > RATIO:
         flags |= DonutFlag.BLENDED
+    if np.isfinite(finest.model).all() and _negative_light(finest.stamp, finest.solution) > _NEGATIVE:
+        return StarFit(DonutFlag.NO_DONUT)
     if not (finest.solution.converged and np.isfinite(finest.model).all()):
         return StarFit(flags | DonutFlag.NOT_CONVERGED, finest)
-    if _negative_light(finest.stamp, finest.solution) > _NEGATIVE:
-        return StarFit(DonutFlag.NO_DONUT)
     lost = fitter.lost_light(finest.full, finest.solution)
     if lost.any_pixel > _LOST:
         return StarFit(DonutFlag.MOSTLY_LOST)
