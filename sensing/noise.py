@@ -126,7 +126,7 @@ def measured_noise(
     if sky_level > _SKY_LEFT_IN * np.sqrt(of_sky):
         slope = min(slope, of_sky / sky_level)
         sky = max(float((variance - slope * level)[faint].mean()), 0.0)
-    slope = float(np.clip(growth * slope, *(limit / unit for limit in _PHOTON_LIMITS)))
+    slope = float(np.clip(growth * slope * unit, *_PHOTON_LIMITS)) / unit
     return PixelNoise(growth * sky, slope)
 
 
