@@ -11,6 +11,7 @@ of f/2.5 have 1.8 arcsec for 0.6. Neither is it where images are small. Then fit
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -32,6 +33,9 @@ from .star_fitter import SMALLEST_DONUT, StarSolution
 
 #: Donuts that are asked.
 _VOTERS = 3
+#: Chi-square by which rays have to fit better: twice the logarithm of the odds that light is diffracted, as that of
+#: stars is, by which faint images are decided.
+_BEFOREHAND = 2.0 * math.log(10.0)
 #: Part of the strength of the turbulence that stands for diffracted light, from which on derivatives at the seeing of a
 #: fit by rays say nothing of one by waves: LSST, DECam and HSC have 0.1 to 0.23, 1.2 m at f/2.5 0.34 to 0.42.
 _MUCH = 0.3
@@ -74,14 +78,11 @@ def _rim_amplitude(instrument: Instrument, star: StarSolution) -> _RimAmplitude 
     if instrument.known_seeing:
         scales[STRENGTH] = 0.0
     light_column, residual = point.over_noise(diffracted[..., None].astype(np.float32))[:, 0], point.pulls
-    prior = np.zeros(len(scales))
-    precision = np.concatenate([instrument.terms.precision, light.shift_precision])
-    prior[len(unknowns) :] = precision
-    state = np.concatenate([np.zeros(len(unknowns)), wave])
+    prior, deviation = instrument.prior(light, unknowns, wave)
     curvature = columns.T @ columns * np.outer(scales, scales) + np.diag(prior)
     scale = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
     cross = scales * (columns.T @ light_column) / scale
-    gradient = (scales * (columns.T @ residual) - prior * state) / scale
+    gradient = (scales * (columns.T @ residual) - prior * deviation) / scale
     solved = np.linalg.pinv(curvature / np.outer(scale, scale), rcond=1e-12, hermitian=True) @ np.stack(
         [cross, gradient], axis=1
     )
@@ -99,10 +100,12 @@ def _has_air(star: StarSolution) -> bool:
 
 
 def _waves_fit_better(amplitudes: Sequence[_RimAmplitude]) -> bool | None:
-    """Return whether donuts together have less chi-square with diffraction than without; None where they do not say."""
-    if sum((2.0 * a.value - 1.0) * a.precision for a in amplitudes) > 0.0:
+    """Return whether donuts together have diffraction, unless rays fit better; None where they do not say."""
+    if not amplitudes:
+        return None
+    if sum((2.0 * a.value - 1.0) * a.precision for a in amplitudes) > -_BEFOREHAND:
         return True
-    linear = amplitudes and np.mean([a.seeing for a in amplitudes]) < _MUCH
+    linear = np.mean([a.seeing for a in amplitudes]) < _MUCH
     return False if linear else None
 
 
@@ -135,7 +138,7 @@ class DiffractionVote(NamedTuple):
 def vote_on_diffraction(
     instrument: Instrument, alone: Callable[..., StarFit], count: int, pool: Executor
 ) -> DiffractionVote:
-    """Return whether diffraction lowers chi-square of the first stars.
+    """Return whether the first stars have diffraction: it lowers chi-square, or they hardly tell.
 
     Parameters
     ----------

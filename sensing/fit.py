@@ -43,7 +43,7 @@ from .interrupted_fit import InterruptedFitError
 from .light import Instrument, StarLight
 from .likelihood import pulls
 from .model import DonutModel
-from .noise import PixelNoise, faint_level, measured_noise, smoothed
+from .noise import AssumedElectron, PixelNoise, faint_level, measured_noise, smoothed
 from .result import DonutFit
 from .rim_table import moved_rims, rim_table
 from .shared_rims import contradicted
@@ -366,15 +366,16 @@ def _fit_with_noise(
         noise = measured_noise(image, smooth - level, used, level)
     else:
         noise = _noise_of(begun.usable, begun.unit)
+    brightest = float((smooth - level)[used].max(initial=0.0))
     for _ in range(_NOISE_FITS):
         unit = noise.photon
         pixels = Pixels(image / unit, np.full(image.shape, noise.sky / unit**2), used)
-        fitted = fit(pixels, sky_level=level / unit, begun=begun)
-        if 1.0 / _NOISE_AGREES < fitted.unit < _NOISE_AGREES:
+        fitted = fit(pixels, electron=AssumedElectron(unit, level / unit), begun=begun)
+        if fitted.usable is None:
             break
-        if fitted.usable is not None:
-            noise = _noise_of(fitted.usable, unit * fitted.unit)
-        begun = None
+        assumed, noise, begun = noise, _noise_of(fitted.usable, unit * fitted.unit), None
+        if 1.0 / _NOISE_AGREES < noise.variance(brightest) / assumed.variance(brightest) < _NOISE_AGREES:
+            break
     return replace(fitted, unit=unit * fitted.unit, level=level)
 
 

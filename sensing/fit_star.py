@@ -17,6 +17,7 @@ from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y
 from .light import Instrument, StarLight
 from .likelihood import Stamp, model_image
 from .neighbours import NeighbourSearch, explains_more
+from .noise import AssumedElectron
 from .rim_search import MOST_BODIES, RimFit, RimSolver, settled, with_another_rim
 from .sides import CONTRADICTED, BothSides, SideFit
 from .solve import COARSE, Solution
@@ -112,7 +113,7 @@ def fit_star(
     strength: float,
     *,
     wavefront: bool,
-    sky_level: float | None = None,
+    electron: AssumedElectron | None = None,
     begun: StarFit | None = None,
     preliminary: bool = False,
 ) -> StarFit:
@@ -126,9 +127,9 @@ def fit_star(
         Strength of the turbulence [1/m]: a start, or the value where the seeing is known.
     wavefront : bool
         Whether the wavefront is fitted; where not, it is zero.
-    sky_level : float, optional
-        Light of the sky that was taken off, where noise is not known: that of the result is what the fit leaves, in a
-        unit in which light has the noise of electrons.
+    electron : AssumedElectron, optional
+        What is taken for an electron where noise is not known: that of the result is what the fit leaves, in a unit in
+        which light has the noise of electrons.
     begun : StarFit, optional
         Fit of a model without diffraction, or without some of the Zernikes, in the same unit, from which this one
         begins if its search left no question.
@@ -139,7 +140,7 @@ def fit_star(
     donut = across > SMALLEST_DONUT
     fitter = StarFitter(instrument, light, without_bad_pixels(pixels) if donut else pixels, strength, wavefront)
     if begun is not None and begun.usable is not None and _holds(begun, light):
-        return _continued(fitter, pixels, begun, begun.usable, sky_level)
+        return _continued(fitter, pixels, begun, begun.usable, electron)
     fitter, start = _started(fitter)
     pixels = pixels.central(fitter.clean.image.shape)
     flags = DonutFlag.OK
@@ -171,7 +172,7 @@ def fit_star(
         return StarFit(DonutFlag.NO_DONUT)
     if fitter.lost_light(start.stamp, best).any_pixel > _LOST:
         return StarFit(DonutFlag.MOSTLY_LOST)
-    return _finished(fitter, pixels, best, sides, sky_level, search.rivals, preliminary)
+    return _finished(fitter, pixels, best, sides, electron, search.rivals, preliminary)
 
 
 def _is_faint(start: Start, n_term: int) -> bool:
@@ -193,7 +194,7 @@ def _holds(begun: StarFit, light: StarLight) -> bool:
 
 
 def _continued(
-    fitter: StarFitter, pixels: Pixels, begun: StarFit, best: StarSolution, sky_level: float | None
+    fitter: StarFitter, pixels: Pixels, begun: StarFit, best: StarSolution, electron: AssumedElectron | None
 ) -> StarFit:
     """Return the outcome of a fit from the best model of one that has begun, with its rims if none are those of all."""
     shape, solution, own_rims = best.full.used.shape, best.solution, best.light.free_rims
@@ -212,7 +213,7 @@ def _continued(
         RimFit(fitter.with_free_rims(rival.rims).light, best.stamp, begin(rival.wave)) for rival in own_rivals
     )
     best_begun, fitter = begin(solution.shared[:known]), fitter.beginning_from(best)
-    return _finished(fitter, pixels.central(shape), best_begun, begun.sides, sky_level, rivals)
+    return _finished(fitter, pixels.central(shape), best_begun, begun.sides, electron, rivals)
 
 
 class CoarseFit(NamedTuple):
@@ -246,7 +247,7 @@ def _finished(
     pixels: Pixels,
     best: Solution,
     sides: BothSides | None,
-    sky_level: float | None,
+    electron: AssumedElectron | None,
     rivals: tuple[RimFit, ...] = (),
     preliminary: bool = False,
 ) -> StarFit:
@@ -260,10 +261,10 @@ def _finished(
         flags |= DonutFlag.RIM_MOVED
     if len(finest.solution.stars[0]) > RATIO:
         flags |= DonutFlag.BLENDED
+    if np.isfinite(finest.model).all() and _negative_light(finest.stamp, finest.solution) > _NEGATIVE:
+        return StarFit(DonutFlag.NO_DONUT)
     if not (finest.solution.converged and np.isfinite(finest.model).all()):
         return StarFit(flags | DonutFlag.NOT_CONVERGED, finest)
-    if _negative_light(finest.stamp, finest.solution) > _NEGATIVE:
-        return StarFit(DonutFlag.NO_DONUT)
     lost = fitter.lost_light(finest.full, finest.solution)
     if lost.any_pixel > _LOST:
         return StarFit(DonutFlag.MOSTLY_LOST)
@@ -273,8 +274,8 @@ def _finished(
         flags |= DonutFlag.OTHER_SIZE
     if sides is not None and sides.ambiguous:
         flags |= DonutFlag.AMBIGUOUS_SIDE
-    if sky_level is not None and flags.usable:
-        finest, unit = fitter.with_measured_noise(finest, sky_level)
+    if electron is not None and flags.usable:
+        finest, unit = fitter.with_measured_noise(finest, electron)
     return StarFit(flags, finest, unit, sides=sides, preliminary=preliminary)
 
 

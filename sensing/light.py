@@ -17,14 +17,14 @@ from ..wavefront.psf.light import Light
 from ..wavefront.psf.pupil_rims import PIECES, PupilRims, pupil_rims
 from ..wavefront.request import relative_weights, wavelength_points
 from .donut_rays import ZernikeRays, chief_landing
-from .image_model import ImageGrid
+from .image_model import STRENGTH, ImageGrid
 from .likelihood import Stamp
 from .model import DonutModel
 from .moving_rims import FreeRims, rims_of_other_size
 from .pupil_cells import PupilCells
 from .response_slope import cells_with_response
 from .rim_outlines import concentric
-from .seeing import Seeing
+from .seeing import Seeing, StrengthPrior
 from .shared_air import shared_air
 from .stamps import Pixels
 from .terms import WavefrontTerms
@@ -136,6 +136,22 @@ class Instrument:
     def known_seeing(self) -> bool:
         """Whether the strengths of the turbulence are held."""
         return self.model.air.fwhm is not None
+
+    @property
+    def strength_prior(self) -> StrengthPrior | None:
+        """Prior of the strengths of the turbulence; None where these are held."""
+        return None if self.known_seeing else StrengthPrior(self.seeing.usual_strength)
+
+    def prior(self, light: StarLight, unknowns: np.ndarray, wave: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return inverse variances of the priors of a star's unknowns and its wavefront, and deviations from means."""
+        count = len(unknowns)
+        precision = np.concatenate([np.zeros(count), self.terms.precision, light.shift_precision])
+        deviation = np.concatenate([np.zeros(count), wave])
+        deviation[len(deviation) - len(light.shift_mean) :] -= light.shift_mean
+        if (of_strength := self.strength_prior) is not None:
+            strength = float(unknowns[STRENGTH])
+            precision[STRENGTH], deviation[STRENGTH] = of_strength.precision(strength), of_strength.deviation(strength)
+        return precision, deviation
 
     @property
     def shared_air(self) -> float:

@@ -21,8 +21,6 @@ from .seeing import Seeing
 
 #: Site of telescopes that state none; of its layers a mean image depends on nothing but the seeing.
 _SITE = "cerro_pachon"
-#: Seeing that a search starts from [rad].
-_START_FWHM = 0.8 * ARCSEC
 #: Largest seeing [rad]: no image of a star is as wide.
 _MOST_FWHM = 60.0 * ARCSEC
 #: Sides of pixels of detectors [m].
@@ -49,7 +47,7 @@ class DonutAir:
     Attributes
     ----------
     fwhm : float, array [n] or Quantity, optional
-        Seeing [rad], if it is known; fitted by default. 0 is no atmosphere.
+        Seeing [rad], if it is known; fitted by default, with a prior of 0.36 to 1.8 arcsec. 0 is no atmosphere.
     outer_scale : float
         Outer scale of the turbulence [m]; infinite for Kolmogorov's.
     atmosphere : Atmosphere, optional
@@ -100,7 +98,7 @@ class DonutAir:
     def strengths(self, seeing: Seeing, count: int) -> list[float]:
         """Return the strength of the turbulence of each of so many stars [1/m]: known, or a start of its search."""
         if self.fwhm is None:
-            return [seeing.strength(_START_FWHM)] * count
+            return [seeing.usual_strength] * count
         return [seeing.strength(float(v)) for v in one_for_each(radians(self.fwhm, "fwhm"), count, "fwhm")]
 
 
@@ -239,8 +237,8 @@ class DonutModel:
     diffraction : bool, optional
         Whether light is diffracted at the rims of the pupil, as that of real stars is: it takes light from strips along
         the rims of the image. A fit of rays takes their lack for 35 to 45 nm of wavefront, most of it Z11 (LSST, 1.5
-        mm, 620 nm, 0.8"), and a wider seeing. Images made of rays alone have none. By default it is on where it lowers
-        chi-square of the first donuts; ``fit.diffraction`` says so. Images are drawn as their engine has it.
+        mm, 620 nm, 0.8"), and a wider seeing. Images made of rays alone have none. By default it is on
+        unless rays fit the first donuts better; ``fit.diffraction`` says so. Images are drawn as their engine has it.
     n_pupil : int, optional
         Cells across the pupil of a fit; by default as many as an image needs.
     """

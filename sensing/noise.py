@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 
 from ..core.statistics import RMS_PER_MAD
 
-#: Least and largest variance of light over its amount [units of the image].
+#: Least and largest variance of light over its amount [units of the image as it came].
 _PHOTON_LIMITS = (0.1, 1e4)
 #: Groups of pixels of like brightness, of a thousand squares at most in the first.
 _GROUPS = 12
@@ -55,9 +55,35 @@ class PixelNoise:
     sky: float
     photon: float
 
+    def variance(self, light: float) -> float:
+        """Return the variance of a pixel of so much light of the star [squared units of the image]."""
+        return self.sky + self.photon * light
+
+
+@dataclass(frozen=True)
+class AssumedElectron:
+    """What is taken for an electron in an image whose noise is not known.
+
+    Attributes
+    ----------
+    size : float
+        Its light [units of the image].
+    sky_level : float
+        Light of the sky that was taken off [of these electrons].
+    """
+
+    size: float
+    sky_level: float
+
 
 def measured_noise(
-    residual: np.ndarray, brightness: np.ndarray, used: np.ndarray, sky_level: float, *, correlated: bool = False
+    residual: np.ndarray,
+    brightness: np.ndarray,
+    used: np.ndarray,
+    sky_level: float,
+    *,
+    correlated: bool = False,
+    unit: float = 1.0,
 ) -> PixelNoise:
     """Return the noise of the pixels of an image, of electrons or any other unit.
 
@@ -73,6 +99,8 @@ def measured_noise(
         Light of the sky that is left in the image, if it is above zero.
     correlated : bool
         Whether noise may be correlated from pixel to pixel, which only the residuals of a fit tell from light.
+    unit : float
+        Unit of all arguments and of the noise over that of the image as it came.
     """
     differences, light = _differences(residual, used), _means(brightness)
     counted = np.isfinite(differences)
@@ -98,7 +126,7 @@ def measured_noise(
     if sky_level > _SKY_LEFT_IN * np.sqrt(of_sky):
         slope = min(slope, of_sky / sky_level)
         sky = max(float((variance - slope * level)[faint].mean()), 0.0)
-    slope = float(np.clip(growth * slope, *_PHOTON_LIMITS))
+    slope = float(np.clip(growth * slope * unit, *_PHOTON_LIMITS)) / unit
     return PixelNoise(growth * sky, slope)
 
 

@@ -224,13 +224,11 @@ def rim_gains(instrument: Instrument, fit: RimFit) -> tuple[list[RimBody], np.nd
     )
     first = len(star) + len(wave)
     fitted = np.flatnonzero(np.arange(first) != (STRENGTH if instrument.known_seeing else -1))
-    precision = np.concatenate([np.zeros(len(star)), instrument.terms.precision, light.shift_precision])
-    mean = np.concatenate([np.zeros(first - len(light.shift_mean)), light.shift_mean])
-    values = np.concatenate([np.zeros(len(star)), wave])
+    precision, deviation = instrument.prior(light, star, wave)
     inner = point.columns.T @ point.columns * np.outer(point.scales, point.scales) + np.diag(precision)
     inner = inner[np.ix_(fitted, fitted)]
     cross = (point.columns.T @ shadow_columns * np.outer(point.scales, scales))[fitted]
-    slope = (point.columns.T @ point.pulls * point.scales - precision * (values - mean))[fitted]
+    slope = (point.columns.T @ point.pulls * point.scales - precision * deviation)[fitted]
     scale = np.sqrt(np.maximum(np.diag(inner), 1e-300))
     projected = np.linalg.lstsq(inner / np.outer(scale, scale), cross / scale[:, None], rcond=1e-12)[0] / scale[:, None]
     gradient = shadow_columns.T @ point.pulls * scales - projected.T @ slope

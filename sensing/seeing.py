@@ -26,6 +26,12 @@ from ..wavefront.atmosphere.turbulence import (
 _KOLMOGOROV = 6.88388
 # FWHM of a Kolmogorov image over wavelength / r0.
 _KOLMOGOROV_FWHM = 0.975863
+# Seeing of telescopes in the median [rad].
+_USUAL_FWHM = 0.8 * ARCSEC
+# Standard deviation of the logarithm of the seeing about that: 95 % of 0.36 to 1.8 arcsec.
+_USUAL_RANGE = 0.4
+# Odds of any other strength, as images without air have, over those of the median.
+_OTHERWISE = 5e-5
 # Strengths between which the FWHM is tabulated [1/m]: r0 of 0.5 m to 2 cm.
 _STRENGTHS = np.geomspace(2.0, 50.0, 15)
 _TABLE_POINTS = 4096
@@ -52,11 +58,48 @@ class Seeing:
         scale = np.interp(np.log(inside), np.log(_STRENGTHS), widths / _STRENGTHS)
         return np.asarray(strength * scale)
 
+    @property
+    def usual_strength(self) -> float:
+        """Strength of the seeing that telescopes have in the median [1/m]: a search starts there."""
+        return self.strength(_USUAL_FWHM)
+
     def strength(self, fwhm: float) -> float:
         """Return the strength [1/m] of a full width at half maximum [rad]."""
         if fwhm == 0.0:
             return 0.0
         return float(brentq(lambda s: float(self.fwhm(np.asarray(s))) - fwhm, 0.0, 100.0 * fwhm / ARCSEC))
+
+
+@dataclass(frozen=True)
+class StrengthPrior:
+    """Prior of the strength of turbulence: faint images tell little of it, and fit their noise best without any.
+
+    It is a normal distribution of the logarithm of the strength, beside which no strength is ruled out.
+
+    Attributes
+    ----------
+    usual : float
+        Its median [1/m].
+    """
+
+    usual: float
+
+    def loss(self, strength: float) -> float:
+        """Return twice the negative logarithm of the density at a strength over that at the median."""
+        return -2.0 * math.log((self._density(strength) + _OTHERWISE) / (1.0 + _OTHERWISE))
+
+    def precision(self, strength: float) -> float:
+        """Return the inverse variance [m^2] of a normal density of the same slope at a strength."""
+        density = self._density(strength)
+        return density / (density + _OTHERWISE) / (_USUAL_RANGE * strength) ** 2
+
+    def deviation(self, strength: float) -> float:
+        """Return how far a strength is from the mean of that density [1/m]."""
+        return strength * math.log(strength / self.usual)
+
+    def _density(self, strength: float) -> float:
+        """Return the normal density of the logarithm of a strength over its maximum."""
+        return math.exp(-0.5 * (math.log(strength / self.usual) / _USUAL_RANGE) ** 2)
 
 
 @lru_cache(maxsize=16)

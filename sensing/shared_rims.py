@@ -170,6 +170,7 @@ def group_with_rims(
         transient,
         prior_mean=np.concatenate([np.zeros(first), rims.means]),
         limits=np.concatenate([np.full(first, np.inf), rims.limits]),
+        strength_prior=instrument.strength_prior,
     )
 
 

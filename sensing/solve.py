@@ -12,6 +12,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from .image_model import EXPONENT_GROWTH, FLUX, STRENGTH, neighbours_of
 from .likelihood import NormalEquations, Stamp, normal_equations
+from .seeing import StrengthPrior
 
 #: A step that is to lower twice the negative logarithm of the likelihood by less, per unit of chi-square a pixel, is
 #: the last: a fifth of a standard deviation, of which the step leaves a hundredth.
@@ -59,6 +60,8 @@ class Group:
         Means of the priors; zero by default.
     limits : ndarray, shape [n_shared], optional
         Largest distances of the shared unknowns from these means; infinite by default.
+    strength_prior : StrengthPrior, optional
+        Prior of the strengths of the turbulence, where these are not held; none by default.
     """
 
     stamps: tuple[Stamp, ...]
@@ -68,6 +71,7 @@ class Group:
     transient: bool = False
     prior_mean: np.ndarray | None = None
     limits: np.ndarray | None = None
+    strength_prior: StrengthPrior | None = None
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -241,6 +245,12 @@ def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executo
         gradient[star] = equations.gradient[:size]
         gradient[n_star:] += group.maps[i].T @ equations.gradient[size:]
     loss = sum(e.loss for e in star_equations) + float(group.precision @ deviation**2)
+    if group.strength_prior is not None:
+        for at in bounds[:-1] + STRENGTH:
+            precision = group.strength_prior.precision(joined[at])
+            curvature[at, at] += precision
+            gradient[at] -= precision * group.strength_prior.deviation(joined[at])
+            loss += group.strength_prior.loss(joined[at])
     if not (np.isfinite(loss) and np.isfinite(curvature).all() and np.isfinite(gradient).all()):
         # No step starts there, and none leads there.
         curvature, gradient, loss = np.zeros_like(curvature), np.zeros_like(gradient), np.inf

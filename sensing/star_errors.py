@@ -114,15 +114,14 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     point = linearized(star.stamp, solution.stars[0], solution.waves[0])
     if point is not None and len(solution.shared):
         beside = _TermsBeside(instrument, star, point)
-        precision = np.concatenate([np.zeros(n_star), terms.precision, star.light.shift_precision])
-        means = np.concatenate([np.zeros(n_star + len(terms.precision)), star.light.shift_mean])
+        precision, deviation = instrument.prior(star.light, solution.stars[0], solution.shared)
         power = residual_power(
             point,
             photons,
             resolution(instrument, star),
             beside.patterns,
             beside.unfitted,
-            precision * (np.concatenate([solution.stars[0], solution.shared]) - means),
+            precision * deviation,
         )
         residuals = power.covariance
         lacking += residuals[:n_star, :n_star]

@@ -17,7 +17,7 @@ from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y, S
 from .light import Instrument, Sampling, StarLight
 from .likelihood import Stamp, model_image, pulls
 from .moving_rims import FreeRims
-from .noise import measured_noise
+from .noise import AssumedElectron, measured_noise
 from .rim_search import RimFit, RimSolver, finished
 from .solve import FINE, STEPS, Group, Solution, solve
 from .stamps import Match, Pixels, match_template, measured_variance
@@ -50,6 +50,8 @@ _SHARED = 2.0
 _ENOUGH = 1.25
 #: Cells across the pupil from which on those on rims leave less chi-square than rims that explain an image alike.
 _FOR_RIVALS = 120
+#: Error of the wavefront by photons [m] beyond which pixels become no smaller for a seeing.
+_FAINT = 1e-7
 #: Noll indices without which rims are not searched for.
 _TERMS_FOR_RIMS = np.arange(4, 23)
 
@@ -142,6 +144,7 @@ class StarFitter:
         self.instrument, self.clean, self._wavefront = instrument, clean, wavefront
         self.donut = light.diameter > SMALLEST_DONUT * instrument.pixel
         self._strength = strength
+        self._strength_prior = instrument.strength_prior
         self._fwhm = float(instrument.seeing.fwhm(np.asarray(strength)))
         self._set_light(light)
         self._binned: dict[int, Pixels] = {}
@@ -318,15 +321,14 @@ class StarFitter:
             model = model_image(full, best.stars[0], best.waves[0])
         return StarSolution(self._light, stamp, full, best, model, fine.sampling)
 
-    def with_measured_noise(self, star: StarSolution, sky_level: float) -> tuple[StarSolution, float]:
+    def with_measured_noise(self, star: StarSolution, electron: AssumedElectron) -> tuple[StarSolution, float]:
         """Return a solution in the unit in which what it leaves has the noise of electrons, and that unit."""
         if star.light is not self._light:
-            return self.with_light(star.light).with_measured_noise(star, sky_level)
+            return self.with_light(star.light).with_measured_noise(star, electron)
         unknowns, wave = star.solution.stars[0], star.solution.waves[0]
         level = model_image(star.full, np.where(np.arange(len(unknowns)) == FLUX, 0.0, unknowns), wave)
-        noise = measured_noise(
-            star.full.image - star.model, star.model - level, star.full.used, sky_level, correlated=True
-        )
+        residual, light = star.full.image - star.model, star.model - level
+        noise = measured_noise(residual, light, star.full.used, electron.sky_level, correlated=True, unit=electron.size)
         unit, sky = noise.photon, noise.sky / noise.photon**2
 
         def rescaled(stamp: Stamp) -> Stamp:
@@ -363,7 +365,8 @@ class StarFitter:
             error = math.sqrt(min(solution.loss / last.stamp.used.sum(), 1.0)) * self._error(solution)
             if not self._sampling(_ENOUGH * fwhm, last.pixels.side, _ENOUGH * error)[1].finer_than(last.sampling):
                 return last
-            pixels, sampling = self._sampling(fwhm, min(self._side(fwhm), last.pixels.side), error)
+            side = last.pixels.side if _FAINT < error < math.inf else min(self._side(fwhm), last.pixels.side)
+            pixels, sampling = self._sampling(fwhm, side, error)
         stamp = self.sampled_stamp(pixels, sampling, light.diameter if blended else self._overhang(solution))
         return _Fine(stamp, pixels, sampling, few_cells)
 
@@ -460,7 +463,7 @@ class StarFitter:
         n = self._map.shape[2]
         known = self.instrument.known_seeing
         mean, limits = self._mean[:n], self._limits[:n]
-        group = Group((stamp,), self._map, self.precision[:n], known, prior_mean=mean, limits=limits)
+        group = Group((stamp,), self._map, self.precision[:n], known, False, mean, limits, self._strength_prior)
         start = np.zeros(n) if shared is None else shared
         return solve(group, [star], start, tolerance=tolerance, steps=steps, hopeless=hopeless)
 

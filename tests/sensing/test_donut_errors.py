@@ -261,40 +261,41 @@ def test_noise_and_unit_of_images_need_not_be_known(behind_focus):
 CASES = ("noise", "correlated noise", "gain 1.7", "sky left in", "chord", "air unknown", "chord, not searched")
 
 
-#: Donuts of each case, and draws of the noise of each.
-N_DONUTS, N_NOISE = 10, 2
+#: Donuts of a case, and draws of the noise of each; of air, of which each donut has one draw alone, donuts.
+N_DONUTS, N_NOISE, N_AIR = 10, 2, 60
 
 
 def further_spreads():
     """Rms [m] of Z23 to Z78: 10 nm of the lowest, less with the degree and rings, as LSST's bent mirrors have it."""
     degrees = np.array([noll_to_nm(j) for j in range(23, 79)])
     rings = (degrees[:, 0] - abs(degrees[:, 1])) // 2
-    return 10e-9 * 0.65 ** (degrees[:, 0] + rings - 6.0)
+    return 10e-9 * 0.68 ** (degrees[:, 0] + rings - 6.0)
 
 
-def drawn(rng, count):
+def drawn(rng, donuts, count):
     """Normal draws for all donuts, each column with a mean square of 1: chance is in their combinations alone."""
-    values = rng.normal(size=(N_DONUTS, count))
+    values = rng.normal(size=(donuts, count))
     return values / np.sqrt((values**2).mean(axis=0))
 
 
 def wavefronts(case, rng):
     """Wavefronts [m] from j = 1, [n, 78]: 200 nm of Z4 to Z22, what telescopes have beyond, and what the air adds."""
-    waves = np.zeros((N_DONUTS, 78))
-    waves[:, 3:22] = rng.normal(size=(N_DONUTS, 19))
+    donuts = N_AIR if case == "air unknown" else N_DONUTS
+    waves = np.zeros((donuts, 78))
+    waves[:, 3:22] = rng.normal(size=(donuts, 19))
     waves *= 200e-9 / np.linalg.norm(waves, axis=1)[:, None]
-    waves[:, 22:] = further_spreads() * drawn(rng, 56)
+    waves[:, 22:] = further_spreads() * drawn(rng, donuts, 56)
     seen = waves.copy()
     if case == "air unknown":
         # 110 nm: an exposure of 15 s at Cerro Pachon.
         values, vectors = np.linalg.eigh(110e-9**2 * air_shape(78, 0.61, 25.0 / 4.18))
-        seen[:, 3:] += drawn(rng, 75) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+        seen[:, 3:] += drawn(rng, donuts, 75) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
     return waves[:, 3:22], seen
 
 
 @pytest.fixture(scope="module")
 def lights(behind_focus):
-    """Light of ten donuts by the kind of a case: fields, true wavefronts and images, drawn once."""
+    """Light of donuts by the kind of a case: fields, true wavefronts and images, drawn once."""
     vignetting = replace(
         behind_focus,
         surfaces=tuple(
@@ -326,7 +327,7 @@ def test_calibration(behind_focus, lights, case):
     model = replace(BLUR, rims=pachon.sensing.DonutRims(search=case != "chord, not searched"))
     squares, variances, chi2 = [], [], []
     kind = next((kind for kind in ("chord", "air unknown") if case.startswith(kind)), "")
-    for (field, true, light), _ in itertools.product(lights(kind), range(N_NOISE)):
+    for (field, true, light), _ in itertools.product(lights(kind), range(1 if kind == "air unknown" else N_NOISE)):
         noise = rng.normal(size=light.shape)
         if case == "correlated noise":
             noise = gaussian_filter(noise, 0.8)
@@ -344,8 +345,9 @@ def test_calibration(behind_focus, lights, case):
     ratio = np.mean(squares) / np.mean(variances)
     rms = 1e9 * np.sqrt([np.mean(squares), np.mean(variances)])
     print(f"\n{case}: error {rms[0]:.0f} nm, claimed {rms[1]:.0f}, ratio {ratio:.2f}, chi-square {np.mean(chi2):.2f}")
-    # Ten wavefronts have some fifty independent errors: 20 % by chance alone.
-    assert 0.4 < ratio < 1.6
+    # Ten wavefronts have some fifty independent errors: 20 % by chance alone; sixty of air 10 %.
+    chance = 0.1 if kind == "air unknown" else 0.2
+    assert abs(ratio - 1.0) < 3.0 * chance
 
 
 @pytest.mark.parametrize("side", [3e-17, 3e-11, 3e-8, 1.0])
