@@ -178,9 +178,9 @@ class Instrument:
     @cached_property
     def _amplitudes_by_light(self) -> tuple[np.ndarray, np.ndarray]:
         """Lit fractions of the pupil, rising, and amplitudes there, the mean of those of three moments."""
-        telescope, own = self.telescope, self.atmosphere
+        telescope, stated = self.telescope, self.atmosphere
         # In winds of any exposure: they hardly matter, and are not known.
-        air = Atmosphere.from_site("cerro_pachon", seed=0, r0=own.r0, outer_scale=own.outer_scale)
+        air = Atmosphere.from_site("cerro_pachon", seed=0, r0=stated.r0, outer_scale=stated.outer_scale)
         exposed = ExposedAir.of(air, telescope.pupil_diameter, telescope.pupil_obscuration)
         response, _ = self.moment_response(None)
         lit, amplitudes = amplitudes_by_light(exposed, response, telescope.field_radius)

@@ -109,8 +109,9 @@ def lit_fractions(
         pupil = SpokePupil.fill(2.0 * radius, obscuration, 3 * _AREA_SPOKES, 3)
         return clear_areas(clear_edges(telescope, direction, pupil.unit, wavelength, threads)) / pupil.area
     points = spiral_annulus(radius, obscuration, _AREA_RAYS if rays is None else rays).points
-    parts = (direction[first : first + _STARS] for first in range(0, len(direction), _STARS))
-    return np.concatenate([lit_points(telescope, part, wavelength, points, threads).mean(axis=1) for part in parts])
+    batches = (direction[first : first + _STARS] for first in range(0, len(direction), _STARS))
+    lit = [lit_points(telescope, batch, wavelength, points, threads) for batch in batches]
+    return np.concatenate([batch.mean(axis=1) for batch in lit])
 
 
 def lit_points(

@@ -80,8 +80,8 @@ def _steps_of_pairs(pupil: np.ndarray, diameter: float) -> np.ndarray:
 
 def _both_lit(lit: np.ndarray, near: np.ndarray) -> tuple[float, ...]:
     """Return the parts of pairs at each step that are both lit, mean over fields, of what is lit [n_field, n_point]."""
-    both = near @ (lit.T @ lit).ravel() / (len(lit) * np.maximum(near.sum(axis=1), 1e-9))
-    return tuple(np.maximum(both, 1e-3).tolist())
+    fractions = near @ (lit.T @ lit).ravel() / (len(lit) * np.maximum(near.sum(axis=1), 1e-9))
+    return tuple(np.maximum(fractions, 1e-3).tolist())
 
 
 @lru_cache(maxsize=16)
@@ -96,8 +96,8 @@ def _lit_levels(telescope: Telescope, projection: Projection, wavelength: float)
     lit = lit_points(telescope, field_direction(x, y, projection), wavelength, pupil, 1)
     fraction = lit.mean(axis=1)
     level = np.where(fraction < _LEAST_LIT, -1, np.searchsorted(_LIT_LEVELS, fraction))
-    found = [_both_lit(lit[level == k].astype(np.float64), near) for k in np.unique(level[level >= 0])]
-    return tuple(sorted(found))
+    levels = [_both_lit(lit[level == k].astype(np.float64), near) for k in np.unique(level[level >= 0])]
+    return tuple(sorted(levels))
 
 
 def _terms(field: np.ndarray) -> np.ndarray:
