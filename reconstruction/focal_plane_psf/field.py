@@ -67,9 +67,9 @@ class ShapeField:
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Return e1, e2 and ln size at places, shape [n, 3], and their variances, of the same shape, or None."""
         values = np.zeros((len(places), 3))
-        if self.optics is not None and self.data.places.amplitude is not None:
-            places = self.optics.instrument.at_amplitudes(places, threads)
         if self.optics is not None:
+            if self.data.places.amplitude is not None:
+                places = self.optics.instrument.at_amplitudes(places, threads)
             values += self.optics.shapes(places, threads)
         design = self.optics.design(places, values, threads) if variance and self.optics is not None else None
 

@@ -110,8 +110,7 @@ def lit_fractions(
         return clear_areas(clear_edges(telescope, direction, pupil.unit, wavelength, threads)) / pupil.area
     points = spiral_annulus(radius, obscuration, _AREA_RAYS if rays is None else rays).points
     batches = (direction[first : first + _STARS] for first in range(0, len(direction), _STARS))
-    lit = [lit_points(telescope, batch, wavelength, points, threads) for batch in batches]
-    return np.concatenate([batch.mean(axis=1) for batch in lit])
+    return np.concatenate([lit_points(telescope, batch, wavelength, points, threads).mean(axis=1) for batch in batches])
 
 
 def lit_points(

@@ -63,8 +63,7 @@ class PupilMeans(NamedTuple):
         aberration = near @ np.einsum("fpi,fqi->pq", slopes, slopes).ravel() / np.maximum(pairs, 1.0)
         squares = (slopes**2).sum(axis=(1, 2)) / np.maximum(lit.sum(axis=1), 1.0)
         over_field = np.linalg.lstsq(_terms(fields), squares / max(squares.mean(), 1e-30), rcond=None)[0]
-        wavelengths = np.asarray(inputs.wavelengths, dtype=np.float64)
-        levels = _lit_levels(telescope, inputs.projection, float(wavelengths[len(wavelengths) // 2]))
+        levels = _lit_levels(telescope, inputs.projection, _middle_wavelength(inputs))
         return cls(tuple(aberration.tolist()), _both_lit(lit, near), levels, over_field)
 
     def relative_square(self, slopes: np.ndarray) -> np.ndarray:
@@ -100,6 +99,10 @@ def _lit_levels(telescope: Telescope, projection: Projection, wavelength: float)
     return tuple(sorted(levels))
 
 
+def _middle_wavelength(inputs: PsfInputs) -> float:
+    return float(inputs.wavelengths[len(inputs.wavelengths) // 2])
+
+
 def _terms(field: np.ndarray) -> np.ndarray:
     x, y = field.T
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
@@ -107,11 +110,10 @@ def _terms(field: np.ndarray) -> np.ndarray:
 
 def _slopes(inputs: PsfInputs, fields: np.ndarray, pupil: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return slopes about their mean [rad], zero where dark, [n_field, n_pupil, 2], and what is lit, as 0 and 1."""
-    wavelengths = np.asarray(inputs.wavelengths, dtype=np.float64)
     optics = inputs.trace(
         inputs.telescope,
         fields,
-        wavelengths[len(wavelengths) // 2 :][:1],
+        np.array([_middle_wavelength(inputs)]),
         pupil,
         projection=inputs.projection,
         threads=1,
