@@ -27,7 +27,7 @@ from pachon.core.units import ARCMIN, ARCSEC
 from pachon.wavefront.atmosphere.layers import layer_random
 
 #: Wavelength [m], sampling of the screens and weights of the moments [arcsec].
-WAVELENGTH = {"lsst_v3.3_r": 620e-9, "decam": 640e-9}
+WAVELENGTH = {"lsst_v3.3_r": 620e-9, "decam": 640e-9, "hsc": 760e-9}
 WEIGHTS = (0.5, 0.7, 1.0)
 PLACES = 4
 #: Lags of the table [arcmin], and the half width of their bins as a part of them.
