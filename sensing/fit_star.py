@@ -23,13 +23,11 @@ from .sides import CONTRADICTED, BothSides, SideFit
 from .solve import COARSE, Solution
 from .stamps import Pixels, plane_basis
 from .star_fitter import BRIGHT, SMALLEST_DONUT, StarFitter, StarSolution, Start
+from .undetermined import is_faint, is_hopeless
 
 #: Signal over noise of a donut above a plane background of any level; the noise of a sky reaches 4 somewhere on a
 #: stamp.
 _FOUND = 6.0
-#: The same over the root of the number of Zernikes below which these are often those of the noise, in no seeing at all:
-#: Z4 to Z22 of random donuts were wrong by what is claimed from 40 on, and by 3 to 30 times as much below 25.
-_TELLING = 9.0
 #: Loss a coarse pixel from which on the other side of focus is tried; photons leave 0.1, since smoothed noise is small.
 _MISFIT = 0.15
 #: Fraction of the light beside the stamp or on unused regions from which on a donut is cut off.
@@ -149,7 +147,7 @@ def fit_star(
         small = pixels.image.size < (1.0 - _LOST) * _area(instrument, light)
         flags |= DonutFlag.MOSTLY_LOST if donut and small else DonutFlag.NO_DONUT
     n_term = len(instrument.terms.requested) if wavefront else 0
-    if start.match.flux < len(NUISANCES) + n_term or (not flags and _is_faint(start, n_term)):
+    if start.match.flux < len(NUISANCES) + n_term or (not flags and is_faint(start, n_term)):
         flags |= DonutFlag.TOO_FEW_PHOTONS
     if flags:
         return StarFit(flags)
@@ -158,6 +156,8 @@ def fit_star(
         search = _masked_search(search.fitter, search)
     if donut and search.misfit > _POOR and not _is_between(_size(search.start.stamp, search.best), _LIKE_DONUTS):
         return StarFit(DonutFlag.NO_DONUT | DonutFlag.OTHER_SIZE)
+    if donut and is_hopeless(instrument.terms, search.best):
+        return StarFit(DonutFlag.UNDETERMINED)
     sides, mirrored = None, None
     if donut and wavefront:
         sides, mirrored = _both_sides(search.fitter, search.start, search.best)
@@ -173,11 +173,6 @@ def fit_star(
     if fitter.lost_light(start.stamp, best).any_pixel > _LOST:
         return StarFit(DonutFlag.MOSTLY_LOST)
     return _finished(fitter, pixels, best, sides, electron, search.rivals, preliminary)
-
-
-def _is_faint(start: Start, n_term: int) -> bool:
-    """Return whether noise hides what so many Zernikes do to a donut."""
-    return start.match.significance < _TELLING * n_term**0.5
 
 
 def _area(instrument: Instrument, light: StarLight) -> float:

@@ -22,6 +22,7 @@ from .cross_check import checked_parts
 from .degrees import FreedomEstimate
 from .exposure import ExposureWavefront
 from .fit_star import StarFit
+from .flags import DonutFlag
 from .inputs import noll_indices, small_length
 from .joint_errors import JointErrors, joint_errors
 from .light import Instrument
@@ -40,8 +41,9 @@ from .shared_rims import (
 from .sided_stars import sided_stars
 from .solve import DAMPING, Solution, solve
 from .star_errors import ErrorParts, model_floor, star_errors, with_errors
-from .star_fitter import StarSolution
+from .star_fitter import SMALLEST_DONUT, StarSolution
 from .terms import WavefrontTerms
+from .undetermined import is_undetermined
 
 #: Noll indices of the wavefront that are fitted by default: up to the fifth radial degree.
 NOLL = tuple(range(4, 23))
@@ -154,10 +156,17 @@ class WavefrontFit(ABC):
         return WavefrontTerms.of(noll_indices(self.noll, "noll", 4))
 
     def prepared(self, instrument: Instrument, star: StarFit) -> StarFit:
-        """Return a star that was fitted by itself, made ready for :meth:`solved`: with errors of its wavefront."""
+        """Return a star that was fitted by itself, made ready for :meth:`solved`: with errors of its wavefront.
+
+        A donut whose light leaves that undetermined is flagged.
+        """
         if star.usable is None or not len(star.usable.solution.shared):
             return star
-        return replace(star, best=with_errors(instrument, star.usable))
+        best = with_errors(instrument, star.usable)
+        donut = best.light.diameter > SMALLEST_DONUT * instrument.pixel
+        if donut and is_undetermined(star_errors(instrument, best).parts.total):
+            return StarFit(DonutFlag.UNDETERMINED)
+        return replace(star, best=best)
 
     def sided(self, instrument: Instrument, stars: Sequence[StarFit], fields: np.ndarray) -> list[StarFit]:
         """Return the stars with flags by the side of focus that they say together, if they share unknowns."""
