@@ -82,7 +82,7 @@ def fit_pachon(donuts: DonutSet, moved: str, which: slice = slice(None), fit=Non
         donuts.wavelength,
         sky_variance=donuts.sky,
         moved=moved,
-        model=pachon.DonutModel(detector=pachon.DonutDetector(PIXEL, defocus=donuts.defocus)),
+        model=pachon.DonutModel(detector=pachon.DonutDetector(PIXEL, defocus=donuts.defocus), diffraction=False),
         fit=fit or pachon.sensing.SingleDonuts(NOLL, higher_order=10e-9),
         projection="postel",
         threads=1,
