@@ -84,7 +84,8 @@ class ShapeField:
                 if variance:
                     weights = near.weights(between)
                     unexplained = covariance.at(places[at]) - (between * weights).sum(axis=0)
-                    spread[:, shapes] = unexplained.reshape(-1, len(at)).T
+                    # What varies between neighbouring stars beside their stated noise varies at any place.
+                    spread[:, shapes] = unexplained.reshape(-1, len(at)).T + covariance.nugget
                     if design is not None:
                         ccd = int(places.ccd[at[0]])
                         spread[:, shapes] += self._optics_variance(ccd, shapes, design[at], stars, weights)

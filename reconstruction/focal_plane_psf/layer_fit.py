@@ -54,12 +54,11 @@ _FASTEST = 1.3
 _DIRECTIONS = 64
 _FIRST_DIRECTIONS = 4
 # Standard deviations of the priors: logarithms of speeds, strengths, Fried parameter, which the mean size of the stars
-# gives, outer scale and nuggets.
+# gives, and outer scale.
 _SPEED = 0.3
 _STRENGTH = 0.15
 _FRIED = 0.03
 _OUTER_SCALE = 0.3
-_NUGGET = 1.0
 # Unit of the components of winds [m/s], and least speed of a prior.
 _WIND = 10.0
 _LEAST_SPEED = 0.5
@@ -68,8 +67,9 @@ _LEAST_STRENGTH = 1e-12
 # Steps of the differences: of winds, over less of which the sums over baselines are not smooth, and of logarithms.
 _WIND_STEP = 0.05
 _STEP = 0.01
-# Nugget over the variance: least, at the start, and most.
-_NUGGETS = (0.003, 0.01, 1.0)
+# Nuggets over the variance that are tried first, the least of all among them, and the most.
+_NUGGETS = (0.0003, 0.003, 0.01, 0.03, 0.1, 0.3)
+_MOST_NUGGET = 1.0
 # Gain of the likelihood that ends the search, a tenth of what matters, over its size for each value of a star.
 _GAIN = 0.05
 # Most steps of the search, and of one from a solution.
@@ -188,7 +188,7 @@ class LayerFit:
 
     def evaluations(self, forecast: bool) -> int:
         """Return about how many likelihoods :meth:`search` computes."""
-        return _ITERATIONS + (1 if forecast else _DIRECTIONS)
+        return _ITERATIONS + len(_NUGGETS) + (1 if forecast else _DIRECTIONS)
 
     def search(self, forecast: bool = False, advance: Callable[[int], None] | None = None) -> LayerCovariance:
         """Find the winds, from the most likely of some random directions, or from those of the prior."""
@@ -200,12 +200,10 @@ class LayerFit:
         # Without it strengths would make up for it. By each wind it would take ten times as long as the likelihood.
         first = [self._wavefront_part(start) for start in starts[:_FIRST_DIRECTIONS]]
         self._by_wavefront = np.mean(first, axis=0)
-        values = []
-        for start in starts:
-            values.append(self._likelihood(self._table(start), self._nugget(start), gradient=False)[0])
-            if advance is not None:
-                advance(1)
-        best = starts[int(np.argmax(values))]
+        # No small nugget grows: the likelihood hardly changes with its logarithm.
+        nuggets = [np.r_[starts[0][:-3], np.full(3, math.log(nugget))] for nugget in _NUGGETS]
+        nugget = self._likeliest(nuggets, advance)[-3:]
+        best = self._likeliest([np.r_[start[:-3], nugget] for start in starts], advance)
         self._by_wavefront = self._wavefront_part(best)
         return self._climb(best, _ITERATIONS, advance)
 
@@ -221,26 +219,46 @@ class LayerFit:
         self._by_wavefront = self._wavefront_part(start)
         return self._climb(start, _AGAIN, advance)
 
+    def _likeliest(self, choice: list[np.ndarray], advance: Callable[[int], None] | None) -> np.ndarray:
+        """Return the parameters of the largest likelihood of some."""
+        values = []
+        for parameters in choice:
+            values.append(self._likelihood(self._table(parameters), self._nugget(parameters), gradient=False)[0])
+            if advance is not None:
+                advance(1)
+        return choice[int(np.argmax(values))]
+
     def _climb(self, start: np.ndarray, steps: int, advance: Callable[[int], None] | None) -> LayerCovariance:
         from scipy.optimize import minimize  # a fifth of a second
 
-        def objective(parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        n = len(self._speeds)
+        # In units of the priors all parameters matter alike.
+        unit = np.r_[np.repeat(_SPEED * self._speeds / _WIND, 2), self._widths, np.ones(3)]
+
+        def objective(scaled: np.ndarray) -> tuple[float, np.ndarray]:
             if advance is not None:
                 advance(1)
-            return self._negative_log_posterior(parameters)
+            value, gradient = self._negative_log_posterior(unit * scaled)
+            return value, unit * gradient
 
         count = 3 * sum(len(block) for block in self.blocks)
-        bounds: list[tuple[float | None, float | None]] = [(None, None)] * (len(start) - 3)
-        low, _, high = np.log(_NUGGETS)
+        bounds: list[tuple[float | None, float | None]] = [(None, None)] * (3 * n + 2)
+        low, high = math.log(_NUGGETS[0]), math.log(_MOST_NUGGET)
         optimum = minimize(
             objective,
-            start,
+            start / unit,
             jac=True,
             method="L-BFGS-B",
             bounds=[*bounds, *[(low, high)] * 3],
             options={"maxiter": steps, "maxfun": 2 * steps, "ftol": _GAIN / count},
         )
-        return self._theory.covariance(self._air(optimum.x), self._constant, self._nugget(optimum.x))
+        best = unit * optimum.x
+        return self._theory.covariance(self._air(best), self._constant, self._nugget(best))
+
+    @property
+    def _widths(self) -> np.ndarray:
+        """Standard deviations of the logarithms of strengths, Fried parameter and outer scale, [n_layer + 2]."""
+        return np.r_[np.full(len(self._speeds), _STRENGTH), _FRIED, _OUTER_SCALE]
 
     def _parameters(self, velocities: np.ndarray) -> np.ndarray:
         """Return parameters of winds [n_layer, 2] [m/s], all else as in the prior.
@@ -248,7 +266,7 @@ class LayerFit:
         They are winds, logarithms of the strengths of layers, of the Fried parameter, the outer scale and the nuggets.
         """
         n = len(velocities)
-        return np.concatenate([velocities.ravel() / _WIND, np.zeros(n + 2), np.full(3, math.log(_NUGGETS[1]))])
+        return np.concatenate([velocities.ravel() / _WIND, np.zeros(n + 2), np.full(3, math.log(_NUGGETS[0]))])
 
     def _air(self, parameters: np.ndarray) -> ExposedAir:
         n, prior = len(self._speeds), self._prior
@@ -288,11 +306,10 @@ class LayerFit:
         winds = _WIND * parameters[: 2 * n].reshape(n, 2)
         speed = np.maximum(np.hypot(*winds.T), 1e-3)
         faster = np.log(speed / self._speeds)
-        logarithms = parameters[2 * n :] - np.r_[np.zeros(n + 2), np.full(3, math.log(_NUGGETS[1]))]
-        width = np.r_[np.full(n, _STRENGTH), _FRIED, _OUTER_SCALE, np.full(3, _NUGGET)]
+        logarithms, width = parameters[2 * n : -3], self._widths
         value -= 0.5 * float((faster**2).sum()) / _SPEED**2 + 0.5 * float(((logarithms / width) ** 2).sum())
         gradient[: 2 * n] -= (_WIND * winds * (faster / (_SPEED * speed) ** 2)[:, None]).ravel()
-        gradient[2 * n :] -= logarithms / width**2
+        gradient[2 * n : -3] -= logarithms / width**2
         return -value, -gradient
 
     def _likelihood(

@@ -267,7 +267,11 @@ class FocalPlanePsf(ModelFields, Result):
     def uncertainty(
         self, ccd: str | Sequence[str], x: ArrayLike, y: ArrayLike, *, threads: int | None = None
     ) -> PsfShapes:
-        """Return standard deviations of e1, e2 and the size [rad]; arguments as for :meth:`shapes`."""
+        """Return standard deviations of e1, e2 and the size [rad]; arguments as for :meth:`shapes`.
+
+        By how much stars scatter more than their stated noise is among them: those of held-out stars are these and the
+        noise, in quadrature.
+        """
         return self.predict(ccd, x, y, threads=threads)[1]
 
     @check_arguments

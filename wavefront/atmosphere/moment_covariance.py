@@ -82,7 +82,7 @@ class MomentSampling(NamedTuple):
 #: Sampling of covariances within a per cent, half-variograms at 1' among them.
 FINE = MomentSampling()
 #: Sampling of covariances within 2 %.
-COARSE = MomentSampling(near_spacing=1.4, drift=2.8, near_drift=1.0, least_delays=32)
+COARSE = MomentSampling(drift=2.8, near_drift=1.0, least_delays=32)
 
 
 class ExposedAir(NamedTuple):

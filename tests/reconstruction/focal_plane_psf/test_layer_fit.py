@@ -13,8 +13,8 @@ from pachon.wavefront.atmosphere.moment_covariance import ExposedAir, MomentResp
 
 AIR = ExposedAir((0.0, 4000.0), (0.65, 0.35), ((6.0, 2.0), (-4.0, 9.0)), 15.0, 0.16, 25.0, 40.0, 8.4, 0.6)
 RESPONSE = MomentResponse(6.4e10, 6.7e10, (1e10, 1e20), (1e10, 1e20))
-#: Of the prior: winds of some speed, strengths, Fried parameter, outer scale, nuggets.
-CURVATURE = [20.0] * 4 + [44.0] * 2 + [1111.0, 11.1] + [1.0] * 3
+#: Of the prior: winds of some speed, strengths, Fried parameter, outer scale; nuggets have none.
+CURVATURE = [20.0] * 4 + [44.0] * 2 + [1111.0, 11.1] + [0.0] * 3
 CONSTANT = np.array([1e-6, 1e-6, 1e-6])
 
 
@@ -88,3 +88,15 @@ def test_no_byte_depends_on_the_threads(theory, places, drawn):
         found = fit_of(of_threads, places[few], (drawn[0][few], drawn[1][few])).search(forecast=True)
         tables.append(found.table.tobytes() + found.nugget.tobytes())
     assert tables[0] == tables[1]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("nugget", [0.0, 1e-6])
+def test_noise_that_is_not_stated_is_found_and_none_is_made_up(theory, places, nugget):
+    """By a prior of a hundredth of the variance, nuggets that stars hardly tell took 7 % of what layers have."""
+    noise = np.full((len(places), 3), 1e-6)
+    root = theory.covariance(AIR, CONSTANT, np.full(3, nugget)).root(places, noise.T.ravel())
+    values = root @ np.random.default_rng(7).standard_normal(3 * len(places))
+    fit = fit_of(theory, places, (values.reshape(3, -1).T, noise))
+    found = fit.search(forecast=True)
+    np.testing.assert_allclose(found.nugget, nugget, rtol=0.4, atol=2e-3 * fit._variance.max())

@@ -412,6 +412,14 @@ def test_understated_noise_is_remarked(exposure):
     model = FocalPlanePsf.fit(exposure.stars(noise=exposure.noise[exposure.first] / 3.0), camera=exposure.camera)
     # Stars of three times the stated noise: what is missing goes to the nugget, and chi-square stays at 1.
     assert any("as much in e1 as the stated noise" in w for w in model.warnings)
+    # Other stars scatter about the prediction by its uncertainty and their stated noise.
+    h = ~exposure.first
+    where = (exposure.names[h].tolist(), *exposure.xy[h].T)
+    noise = exposure.noise[h]
+    seen = exposure.truth[h] + noise * np.random.default_rng(3).standard_normal((h.sum(), 3))
+    left, sigma = seen - values(model.shapes(*where)), model.uncertainty(*where)
+    for shape, spread in enumerate((sigma.e1, sigma.e2)):
+        assert np.mean(left[:, shape] ** 2 / (spread**2 + (noise[:, shape] / 3.0) ** 2)) == pytest.approx(1.0, abs=0.2)
 
 
 @pytest.mark.long
