@@ -231,6 +231,10 @@ STACKS = {
             "Shims of rafts lower the mean FWHM: 0.7 arcsec focused as a whole, 0.69 arcsec with them.",
         ),
         (
+            verdicts.shim_verdict("ellipticity", "ccds", SimpleNamespace(rms_g=0.008), SimpleNamespace(rms_g=0.004)),
+            "Shims of CCDs lower the rms of g: 8e-3 focused as a whole, 4e-3 with them.",
+        ),
+        (
             verdicts.reproduced_verdict({"fig1": {"verdict": "agrees"}, "fig2": {"verdict": "differs"}}),
             "1 of 2 figures agree with the paper; fig2 differs.",
         ),
