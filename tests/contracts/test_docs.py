@@ -134,6 +134,14 @@ def test_the_page_of_an_own_telescope_runs_on_its_file(tmp_path, monkeypatch):
     (tmp_path / "corrected.yaml").write_text(text, encoding="utf-8")
     assert CliRunner().invoke(app, ["validate", "corrected.yaml"]).exit_code == 0
     check_shown("own_telescope.md")
+    # The camera file that the page leads to has its CCDs where this telescope's light falls.
+    camera_file = re.search(r"```yaml\n(# my_camera.yaml.*?)```", PAGES["camera.md"], flags=re.S)[1]
+    (tmp_path / "my_camera.yaml").write_text(camera_file, encoding="utf-8")
+    camera, telescope = pachon.load_camera("my_camera.yaml"), pachon.load_telescope("corrected.yaml")
+    corners = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+    pixels = (np.arange(len(camera))[:, None], (camera.pixels[:, None] - 1) * corners)
+    fields = pachon.fields_at(telescope, camera.from_pixel(*pixels).reshape(-1, 2))
+    assert (pachon.vignetting(telescope, fields).lit_fraction > 0.5).all()
     assert (tmp_path / "my_psfs.png").read_bytes().startswith(b"\x89PNG")
 
 
