@@ -178,7 +178,7 @@ def check_command(
     - `pachon check`: does this installation agree with the one that was verified?
     - `pachon check telescope.baseline.json`: after a change of the prescription, in CI
     - `pachon check telescope.baseline.json --model as_built.yaml --json`
-    - `pachon check telescope.baseline.json --set focal_plane.budget_seed=2`: with another key of its configuration
+    - `pachon check telescope.baseline.json --set seed=2`: with another value of a key of its configuration
     """
     from ..studies.baseline.baseline import bundled_baselines, check_baseline
     from ..studies.metrics.camera import CAMERA

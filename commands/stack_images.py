@@ -56,7 +56,7 @@ def stack_images_command(
     **Examples**
 
     - `pachon visits -o deep -n 10`, then `pachon stack-images deep`: the size of one CCD, ten minutes on two cores
-    - `pachon stack-images deep --side 1024`: only 3.4 arcminutes, a few minutes
+    - `pachon stack-images deep --side 1024 --no-measure`: only 3.4 arcminutes, too few stars to measure, a few minutes
     - `pachon stack-images deep --resume`: go on where it was stopped, or with the visits added since
     """
     from ..studies.visits.image_stack.config import ImageStackConfig

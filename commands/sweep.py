@@ -157,7 +157,7 @@ def sweep_status(store: Store, as_json: Json = False) -> None:
         "computed": len(results) - len(problems),
         "failed": len(problems),
         "missing": count - len(results),
-        "seconds_a_point": sum(r.seconds for r in results) / len(results) if results else None,
+        "seconds_a_point": float(f"{sum(r.seconds for r in results) / len(results):.3g}") if results else None,
         "workers": len({r.worker for r in results}),
     }
     _show(status, as_json)

@@ -126,8 +126,9 @@ def shim_verdict(merit: str, parts: str, before: Any, after: Any) -> str:
         "xi": ("rms of ξ+ of g", 1e6, "e-6", "rms_xi_g"),
     }[merit]
     start, end = scale * getattr(before, key), scale * getattr(after, key)
+    moved = {"ccds": "CCDs"}.get(parts, parts)
     verb = "lower" if end < start else "do not lower"
-    return f"Shims of {parts} {verb} the {name}: {start:.4g}{unit} focused as a whole, {end:.4g}{unit} with them."
+    return f"Shims of {moved} {verb} the {name}: {start:.4g}{unit} focused as a whole, {end:.4g}{unit} with them."
 
 
 def reproduced_verdict(figures: Mapping[str, Figures]) -> str:

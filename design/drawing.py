@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.collections import TriMesh
     from matplotlib.figure import Figure, SubFigure
     from matplotlib.legend import Legend
+    from numpy.typing import ArrayLike
 
 #: Red, green, blue and opacity, 0 to 1.
 Color = tuple[float, float, float, float]
@@ -36,9 +37,11 @@ def field_colors(count: int) -> list[Color]:
     return _colors("plasma", 0.05, 0.78, count)
 
 
-def wavelength_colors(count: int) -> list[Color]:
-    """Return a colour for each wavelength of a list, from blue to red; one alone is blue."""
-    return _colors("turbo", 0.12, 0.76, count)
+def wavelength_colors(wavelengths: ArrayLike) -> list[Color]:
+    """Return a colour for each wavelength of a list in any order, the shortest blue, the longest red; one is blue."""
+    values = np.asarray(wavelengths)
+    colors = _colors("turbo", 0.12, 0.76, len(values))
+    return [colors[rank] for rank in np.argsort(np.argsort(values, kind="stable"))]
 
 
 def _colors(name: str, first: float, span: float, count: int) -> list[Color]:

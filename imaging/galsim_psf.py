@@ -7,8 +7,10 @@ from typing import Any
 import galsim
 import numpy as np
 
-from ..core.errors import DomainError
+from ..core.errors import DomainError, shown
 from ..core.units import ARCSEC
+from ..models.camera.camera import Camera
+from ..models.camera.cameras import load_camera
 from ..reconstruction.focal_plane_psf.model import FocalPlanePsf
 from ..reconstruction.psf_model.model import PsfModel
 from ..wavefront.psf.psf import Psfs
@@ -24,6 +26,7 @@ def psf_object(
     psf: Psfs | PsfModel | FocalPlanePsf,
     *,
     star: int = 0,
+    camera: str | Camera | None = None,
     ccd: str | None = None,
     x: float | None = None,
     y: float | None = None,
@@ -43,8 +46,12 @@ def psf_object(
         Images of stars, or a model of them.
     star : int
         Index of the star, for images of stars.
+    camera : str or Camera, optional
+        Camera of the CCD that `wcs` is of. Stamps along the axes of the focal plane, as of :func:`~pachon.make_psfs`
+        and runs, are turned onto the CCD's pixels, whose x runs along y of the focal plane in the LSST. Without a
+        camera stamps are along the pixels, as those of stars of images are.
     ccd : str, optional
-        Name of the CCD, for a model of the focal plane.
+        Name of the CCD, with a camera or for a model of the focal plane.
     x, y : float, optional
         Position, for a model: in the unit of its fit, or [m] for one of the focal plane.
     colour : float, optional
@@ -60,7 +67,10 @@ def psf_object(
     Raises
     ------
     DomainError
-        If there is no such star, a position or the WCS is missing, or no light on the stamp.
+        If there is no such star, a position or the WCS is missing, there is a camera without CCD or local WCS, or no
+        light on the stamp.
+    UnknownNameError
+        If the camera has no such CCD.
     """
     offset, scale = np.zeros(2), None
     if isinstance(psf, Psfs):
@@ -83,6 +93,12 @@ def psf_object(
             "wcs = None: expected a local WCS or the side of a pixel [arcsec], which the model does not have"
         )
     local = galsim.PixelScale(pixel) if isinstance(pixel, (int, float)) else pixel
+    if camera is not None:
+        if ccd is None or isinstance(wcs, (int, float, type(None))):
+            raise DomainError(f"camera = {shown(camera)}: expected ccd and the local WCS of its pixels beside it")
+        mosaic = load_camera(camera)
+        along_pixels = mosaic.along_pixels(mosaic.ccd_index(ccd), np.eye(2)).T
+        local = galsim.JacobianWCS(*(local.jacobian().getMatrix() @ along_pixels).ravel())
     # The middle of the stamp is pixel [size // 2]; GalSim counts from the centre of the image.
     size = np.array(stamp.shape[::-1])
     centre = size // 2 - 0.5 * (size - 1) + offset

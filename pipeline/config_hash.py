@@ -40,9 +40,7 @@ def hashed_content(config: Configuration) -> dict[str, Any]:
     content["focal_plane"] = hashed_heights(content["focal_plane"])
     content["active_optics"] = hashed_states(content["active_optics"])
     content["stars"] = hashed_stars(content["stars"])
-    if config.reconstruction.turbulence == "exponential":
-        # As in hashes from before this key.
-        del content["reconstruction"]["turbulence"]
+    content["reconstruction"] = hashed_reconstruction(content["reconstruction"])
     if config.pointing is None:
         del content["pointing"]
     content["atmosphere"]["site"] = _name_or_content(resolved_value(config.atmosphere.site), ())
@@ -95,6 +93,13 @@ def hashed_stars(section: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in section.items() if key != "observed"} | {
         "catalogue": _name_or_content(name, (), STAR_ENDINGS)
     }
+
+
+def hashed_reconstruction(section: dict[str, Any]) -> dict[str, Any]:
+    """Return the section of the PSF models for a hash, as :func:`hashed_heights` does that of the focal plane."""
+    if section["turbulence"] != "exponential":
+        return section
+    return {key: value for key, value in section.items() if key != "turbulence"}
 
 
 def _name_or_content(name: str, bundled: Sequence[str], endings: Sequence[str] = ENDINGS) -> str:

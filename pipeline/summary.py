@@ -137,7 +137,8 @@ def run_metrics(
     """Return the metrics of a run: of each CCD, of all together, and the correlations.
 
     Keys with ``_g`` are of adaptive moments: g, and dt = (T - T model)/T; those with ``_e`` or neither of weighted
-    ones, as the paper's. ``distortion`` is (a^2 - b^2)/(a^2 + b^2) of adaptive moments, the e of the LSST's
+    ones, as the paper's. ``truth_psfs_with_g`` counts the noise-free PSFs that have adaptive moments, the others being
+    narrower than a pixel. ``distortion`` is (a^2 - b^2)/(a^2 + b^2) of adaptive moments, the e of the LSST's
     requirements; ``scatter`` the rms of a component of the noise-free PSFs about the mean of their CCD, which is
     what a model that is constant on each CCD would leave. ``xi_plus_..._short`` is the mean of xi+ over pairs
     closer than 10 arcmin, ``xi_plus_..._long`` over those from 10 to 180 arcmin. Beside a focal-plane model, keys
@@ -192,6 +193,7 @@ def _common_metrics(products: Sequence[CcdProduct]) -> dict[str, Any]:
         chi2 = {f"chi2_away_{key}": _chi2_away(products, key) for key in _PREDICTED}
     return {
         "truth_psfs": sum(len(p.holdout) for p in products),
+        "truth_psfs_with_g": int(np.isfinite(ellipticities(products, "truth", "g")).all(axis=0).sum()),
         "stars": sum(len(p.observed) for p in products),
         "stars_used": sum(int(p.observed.used.sum()) for p in products),
         **{f"mean_e_{k}": finite_mean(np.hypot(*ellipticities(products, k))) for k in ("truth", "observed")},

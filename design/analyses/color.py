@@ -77,7 +77,7 @@ class LateralColor(Analysis):
         (axes,) = panels
         distance, label = self.axis_distances()
         order = np.argsort(distance, kind="stable")
-        for w, color in enumerate(wavelength_colors(len(self.wavelengths))):
+        for w, color in enumerate(wavelength_colors(self.wavelengths)):
             name = f"{self.wavelengths[w] * 1e9:.4g} nm"
             axes.plot(self.shift[order, w] * 1e6, distance[order], color=color, label=name)
         airy = self.airy_radius[order] * 1e6

@@ -91,7 +91,7 @@ class FieldCurvature(Analysis):
 
     def _draw(self, panels: Sequence[Axes]) -> None:
         distance, field_label = self.axis_distances()
-        colors = wavelength_colors(len(self.wavelengths))
+        colors = wavelength_colors(self.wavelengths)
         largest = max(float(np.nanmax(np.abs([self.tangential, self.sagittal]))), 1e-9)
         scale, unit = (1e6, "µm") if largest < 1e-3 else (1e3, "mm")
         order = np.argsort(distance, kind="stable")

@@ -64,7 +64,7 @@ class Fans(Analysis):
         """Draw values [n_field, n_wave, 2, n] where light passes, all panels on one scale."""
         shown = np.where(self.lit, values, np.nan)
         half = 1.08 * max(float(np.nanmax(np.abs(shown), initial=0.0)), 1e-6)
-        colors = wavelength_colors(len(self.wavelengths)) if len(self.wavelengths) > 1 else [BLUE]
+        colors = wavelength_colors(self.wavelengths) if len(self.wavelengths) > 1 else [BLUE]
         for i, field in enumerate(self.field_labels()):
             for k, name in enumerate(names):
                 axes = panels[2 * i + k]

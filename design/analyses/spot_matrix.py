@@ -102,11 +102,11 @@ class SpotMatrix(Analysis):
         distance = np.linalg.norm(np.where(self.weight[..., None] > 0, self.displacement, 0.0), axis=-1)
         half = 1.08e6 * max(float(distance.max()), float(np.nanmax(self.airy_radius)))
         waves = self.displacement.shape[2]
-        single = drawing.wavelength_colors(n) if self.against == "wavelength" else [BLUE] * n
+        single = drawing.wavelength_colors(self.columns) if self.against == "wavelength" else [BLUE] * n
         rms = self.rms_radius * 1e6
         for k, axes in enumerate(panels):
             i, c = divmod(k, n)
-            colors = [single[c]] if waves == 1 else drawing.wavelength_colors(waves)
+            colors = [single[c]] if waves == 1 else drawing.wavelength_colors(self.wavelengths)
             for w, color in enumerate(colors):
                 lit = self.weight[i, c, w] > 0
                 points = self.displacement[i, c, w, lit] * 1e6

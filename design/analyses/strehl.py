@@ -83,7 +83,7 @@ class StrehlRatios(Analysis):
         (axes,) = panels
         distance, label = self.axis_distances()
         order = np.argsort(distance, kind="stable")
-        colors = wavelength_colors(len(self.wavelengths)) if len(self.wavelengths) > 1 else [BLUE]
+        colors = wavelength_colors(self.wavelengths) if len(self.wavelengths) > 1 else [BLUE]
         for w, color in enumerate(colors):
             name = f"{self.wavelengths[w] * 1e9:.4g} nm"
             axes.plot(distance[order], self.wavefront[order, w], "-", color=color, label=f"{name}, wavefront")

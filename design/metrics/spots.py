@@ -262,7 +262,7 @@ def _weighted_quantile(values: np.ndarray, weights: np.ndarray, fraction: float)
 def _draw_spot(axes: Axes, spots: SpotDiagram, i: int, half: float, radius: float) -> None:
     centered = (spots.displacement[i] - spots.centroid[i]) * 1e6
     names = [f"{w * 1e9:.4g} nm" for w in spots.wavelengths]
-    colors = drawing.wavelength_colors(len(names)) if len(names) > 1 else [BLUE]
+    colors = drawing.wavelength_colors(spots.wavelengths) if len(names) > 1 else [BLUE]
     step = -(-spots.weight[i].size // _DOTS)
     for xy, weight, name, color in zip(centered, spots.weight[i], names, colors, strict=True):
         lit = np.flatnonzero(weight > 0)[::step]

@@ -45,7 +45,7 @@ def draw_before_after(
     panels = spots.subplots(2, len(shown), squeeze=False)
     for row, diagram, numbers, name in zip(panels, diagrams, measured, ("before", "after"), strict=True):
         half = 1.1e6 * float(np.nanmax(diagram.geometric_radius, initial=1e-9))
-        colors = wavelength_colors(len(wavelengths))
+        colors = wavelength_colors(wavelengths)
         for i, axes in enumerate(row):
             centered = (diagram.displacement[i] - diagram.centroid[i]) * 1e6
             for xy, weight, color in zip(centered, diagram.weight[i], colors, strict=True):

@@ -46,6 +46,13 @@ _ROW = 1.6
 _LETTERS_OF_AN_INCH = 17.0
 #: Fewest letters of a line of a title.
 _SHORTEST_LINE = 12
+#: Height of panels of residuals of CCDs in a row along y [inch].
+_TALL_PANEL = 6.0
+#: What colours and whiskers of the residuals are.
+_RESIDUAL_NOTE = (
+    "Of e: colour, rms of one component; whisker, mean residual of the CCD.\n"
+    "Of size: mean of $(T - T_{model})/T$, $T = Q_{11} + Q_{22}$."
+)
 #: Height of a row of a close-up over the width of its panels, least and most.
 _TALL = (0.6, 1.6)
 
@@ -120,14 +127,19 @@ def whiskers_plot(
                 _draw_kind(axes, product, kind, scale, 0.8 if len(products) <= _MANY else 0.5, whisker_limit)
             frame_axes(axes, limits, x_label=not stacked or i == len(kinds) - 1, y_label=stacked or i == 0)
             title = _title_with_count(_TITLES[kind], products, kind, whisker_limit)
-            if tall:  # above the key, in as many lines as it takes
-                width = max(int(_LETTERS_OF_AN_INCH * panel_width), _SHORTEST_LINE)
-                axes.set_title(textwrap.fill(title, width), loc="left", fontsize=8.0, pad=20.0)
+            if tall:
+                _set_title_above_key(axes, title, panel_width)
             else:
                 axes.set_title(title, loc="left")
             draw_key_whisker(axes, key, scale, 1.0)
         _add_height_scale(figure, image, panels, focal_plane, 30)
         return png_bytes(figure)
+
+
+def _set_title_above_key(axes: Axes, title: str, width: float) -> None:
+    """Write a title above the key whisker of a narrow panel of `width` inches, in as many lines as it takes."""
+    letters = max(int(_LETTERS_OF_AN_INCH * width), _SHORTEST_LINE)
+    axes.set_title(textwrap.fill(title, letters), loc="left", fontsize=8.0, pad=20.0)
 
 
 def close_up_plot(products: Sequence[CcdStars], focal_plane: FocalPlane) -> bytes:
@@ -277,40 +289,43 @@ def residual_plot(camera: Camera, columns: Mapping[str, np.ndarray]) -> bytes:
     scale = 0.35 * camera.shortest_side * 1e3 / key
     worst = _robust_maximum(np.concatenate([columns[f"rms_e_{k}"] for k in RESIDUAL_TITLES]))
     sizes = _robust_maximum(np.abs(np.concatenate([columns[f"mean_dt_{k}"] for k in ("residual", "away")])))
+    tall = across < 1.0 / _ROW
+    panel_width = _TALL_PANEL * across if tall else 3.0
     with styled():
-        figure = new_figure(12.5, min(max(2 * 3.6 / across, 2.6) + 1.4, 9.5))
-        rows = figure.subplots(2, 3, squeeze=False)
-        above = ScalarMappable(Normalize(0.0, worst), "viridis")
-        below = ScalarMappable(Normalize(-sizes, sizes), "RdBu_r")
-        for i, (kind, title) in enumerate(RESIDUAL_TITLES.items()):
-            axes = rows[0, i]
-            _draw_ccds(axes, camera, indices, columns[f"rms_e_{kind}"], above)
+        # Panels of CCDs in a row along y stand beside each other.
+        if tall:
+            figure = new_figure(5 * (panel_width + 0.6) + 2.6, _TALL_PANEL + 1.6, "compressed")
+            panels = figure.subplots(1, 5, sharey=True)
+            e_panels, size_panels = panels[:3], panels[3:]
+            figure.supxlabel(_RESIDUAL_NOTE, fontsize=8.5)
+        else:
+            figure = new_figure(12.5, min(max(2 * 3.6 / across, 2.6) + 1.4, 9.5))
+            panels = figure.subplots(2, 3)
+            e_panels, size_panels = panels[0], panels[1, [0, 2]]
+            panels[1, 1].set_axis_off()
+            note = {"xycoords": "axes fraction", "ha": "center", "va": "center", "fontsize": 8.5}
+            panels[1, 1].annotate(_RESIDUAL_NOTE, (0.5, 0.5), **note)
+
+        e_shades = ScalarMappable(Normalize(0.0, worst), "viridis")
+        for axes, kind in zip(e_panels, RESIDUAL_TITLES, strict=True):
+            _draw_ccds(axes, camera, indices, columns[f"rms_e_{kind}"], e_shades)
             ends = whiskers(
                 columns["x_mm"], columns["y_mm"], columns[f"mean_e1_{kind}"], columns[f"mean_e2_{kind}"], scale
             )
             draw_whiskers(axes, ends, "white", 2.6)
             draw_whiskers(axes, ends, "black", 1.2)
-            frame_axes(axes, limits, x_label=kind == "left_out", y_label=i == 0)
-            axes.set_title(title, loc="left", fontsize=8.5)
+            frame_axes(axes, limits, x_label=kind == "left_out", y_label=axes is e_panels[0])
+            _set_title_above_key(axes, RESIDUAL_TITLES[kind], panel_width)
             draw_key_whisker(axes, key, scale, 1.0)
-        for i, kind in ((0, "residual"), (2, "away")):
-            axes = rows[1, i]
-            _draw_ccds(axes, camera, indices, columns[f"mean_dt_{kind}"], below)
-            frame_axes(axes, limits, y_label=i == 0)
-            axes.set_title(RESIDUAL_TITLES[kind], loc="left", fontsize=8.5)
-        rows[1, 1].set_axis_off()
-        rows[1, 1].annotate(
-            "Above: colour, rms of one component of e;\nwhisker, mean residual of the CCD.\n"
-            "Below: mean of $(T - T_{model})/T$, $T = Q_{11} + Q_{22}$.",
-            (0.5, 0.5),
-            xycoords="axes fraction",
-            ha="center",
-            va="center",
-            fontsize=8.5,
-        )
-        figure.colorbar(above, ax=list(rows[0]), fraction=0.03, pad=0.01, extend="max", label="rms of e")
-        label = "mean $\\delta T/T$"
-        figure.colorbar(below, ax=list(rows[1]), fraction=0.03, pad=0.01, extend="both", label=label)
+        size_shades = ScalarMappable(Normalize(-sizes, sizes), "RdBu_r")
+        for axes, kind in zip(size_panels, ("residual", "away"), strict=True):
+            _draw_ccds(axes, camera, indices, columns[f"mean_dt_{kind}"], size_shades)
+            first = axes is size_panels[0]
+            frame_axes(axes, limits, x_label=first or not tall, y_label=first and not tall)
+            _set_title_above_key(axes, RESIDUAL_TITLES[kind], panel_width)
+        scales = ((e_panels, e_shades, "max", "rms of e"), (size_panels, size_shades, "both", "mean $\\delta T/T$"))
+        for row, shades, extend, label in scales:
+            figure.colorbar(shades, ax=list(row), fraction=0.03, pad=0.01, extend=extend, label=label)
         return png_bytes(figure)
 
 

@@ -21,6 +21,9 @@ _NAMES = {
 }
 
 
+#: Least fraction of the noise-free PSFs with adaptive moments for a verdict in g: a failure or two shift no mean.
+LEAST_FRACTION_WITH_G = 0.99
+
 #: What a model that is constant on each CCD would leave.
 ABOUT_MEAN = "about the CCD's mean"
 
@@ -30,7 +33,7 @@ def headline(summary: dict[str, Any]) -> list[tuple[str, str]]:
     metrics = summary["all"]
     rows = [
         ("CCDs", f"{metrics['ccds']}"),
-        ("PSFs known without noise", f"{metrics['truth_psfs']}"),
+        ("PSFs known without noise, with a g", "{truth_psfs}, {truth_psfs_with_g}".format(**metrics)),
         ("observed stars, used in the fit", f"{metrics['stars']}, {metrics['stars_used']}"),
         (
             "FWHM of the noise-free PSFs (at half maximum), median and range",
@@ -69,8 +72,9 @@ def verdict(summary: dict[str, Any]) -> str:
         "g": ("mean_g_truth", "rms_residual_g_away", "rms_scatter_g"),
         "weighted e": ("mean_e_truth", "rms_residual_away", "rms_scatter_e"),
     }
-    # Images narrower than a pixel have no adaptive moments.
-    name = "g" if all(math.isfinite(metrics[key]) for key in keys["g"]) else "weighted e"
+    # Images narrower than a pixel have no adaptive moments; those that have are not typical, but the widest.
+    measured = metrics["truth_psfs_with_g"] >= LEAST_FRACTION_WITH_G * metrics["truth_psfs"]
+    name = "g" if measured and all(math.isfinite(metrics[key]) for key in keys["g"]) else "weighted e"
     mean, residual, scatter = (_percent(metrics[key]) for key in keys[name])
     constant = "a constant PSF" if metrics["ccds"] == 1 else "a constant PSF on each CCD"
     left_out = f"; {lost} {'CCD' if lost == 1 else 'CCDs'} could not be modelled" if lost else ""

@@ -196,7 +196,9 @@ def fit_pixel_fields(
     shapes = shapes[:, :_SHAPE_NUMBERS]
     shape_covariance = shapes @ shapes.T
     contrasts = contrasts_of(shape_covariance)
-    variances = variances_of(residuals, contrasts)
+    # Shape numbers of smooth fields may lie near a line, across which stars show nothing: no correction is larger than
+    # the response itself.
+    variances = np.minimum(variances_of(residuals, contrasts), (response[:_SHAPE_NUMBERS] ** 2).max() / noise_floor)
     if variances.any():
         if len(brightest) < len(noise):
             contrasts = Contrasts.of(shape_covariance, noise)

@@ -24,7 +24,13 @@ from ...models.io.prescription import load_telescope
 from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...pipeline.config import Configuration, digest, load_configuration, with_options
-from ...pipeline.config_hash import hashed_camera, hashed_heights, hashed_photometry, hashed_states
+from ...pipeline.config_hash import (
+    hashed_camera,
+    hashed_heights,
+    hashed_photometry,
+    hashed_reconstruction,
+    hashed_states,
+)
 from ...pipeline.defaults import configured_telescope, with_paper_model
 from ...pipeline.experiment import Experiment
 from ..metrics.camera import CAMERA
@@ -304,6 +310,7 @@ def _input_stamps(telescope: Telescope, experiment: Experiment | None) -> dict[s
         content = hashed_photometry(hashed_camera(content), experiment.config)
         content["focal_plane"] = hashed_heights(content["focal_plane"])
         content["active_optics"] = hashed_states(content["active_optics"])
+        content["reconstruction"] = hashed_reconstruction(content["reconstruction"])
         hashed = digest(content)
     return {"pachon": VERSION, "model_sha256": prescription_hash(telescope), "configuration_sha256": hashed}
 

@@ -46,14 +46,16 @@ class Case:
         if self.interpolation in FOCAL_PLANE:
             return replace(self, basis="moments", order=0, components=3)
         basis = BASES[self.basis]
-        components = self.components if basis.has_components else 0
+        # Variations of pixels, which have no number of components, have the default one.
+        components = (self.components or COMPONENTS) if basis.has_components else 0
         if basis.ordered:
             components = min(components, self.stars - 1)
-        order = self.order if self.interpolation in POLYNOMIALS else self.recipe().interpolation.fixed_order or 0
+        fitted = replace(self, components=components)
+        order = self.order if self.interpolation in POLYNOMIALS else fitted.recipe().interpolation.fixed_order or 0
         interpolation = self.interpolation
         if self.snr == NOISE_FREE and interpolation in POLYNOMIALS:
             interpolation = "equal"
-        return replace(self, components=components, order=order, interpolation=interpolation)
+        return replace(fitted, order=order, interpolation=interpolation)
 
     @classmethod
     def of_recipe(cls, stars: int, snr: float, recipe: Recipe) -> Case:

@@ -51,7 +51,7 @@ _COLORS = ("#b8b8b8", "#7fa8d1", "#1f6fbf", "#0b2a55")
     "fig5",
     "the PSF against exposure time",
     'speckles that add up to a rounder, smoother image; FWHM about 0.5" after 15 s at 600 nm',
-    minutes=(0.3, 11.0),
+    minutes=(0.2, 11.0),
 )
 def speckles(bench: Bench) -> Reproduced:
     """Expose one star for up to 15 s through turbulence alone, by the wave engine (Fig. 5)."""
@@ -155,7 +155,7 @@ def _speckles_plot(images: np.ndarray, times: Sequence[float], width: np.ndarray
     "ellipticity by the atmosphere alone",
     "mean |e| below 1 % in 15 s, coherent over about 1'; xi+ falls with exposure time (1, 5, 15, 60 s), near 2e-5"
     " at most",
-    minutes=(0.3, 15.0),
+    minutes=(0.15, 15.0),
 )
 def ellipticity(bench: Bench) -> Reproduced:
     """Correlate ellipticities by the atmosphere alone on one CCD, by the fast engine (Fig. 6)."""

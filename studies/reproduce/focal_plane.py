@@ -169,7 +169,7 @@ def _budget_plot(rows: Sequence[str], values: Mapping[str, np.ndarray], units: S
     "whiskers of the optics alone",
     "most of the large sticks exceed 10 %, nearly 30 % at the edge of the field; abrupt changes at CCD borders;"
     " less sensitive in the centre",
-    minutes=(0.3, 7.0),
+    minutes=(0.15, 7.0),
 )
 def whiskers_of_optics(bench: Bench) -> Reproduced:
     """Measure ellipticities over the whole focal plane without an atmosphere (Fig. 8), by the wave engine."""

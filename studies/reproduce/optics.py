@@ -164,7 +164,7 @@ def _draw_corner_rafts(axes: Axes, camera: Camera) -> None:
         for y in (-reach - raft, reach):
             axes.add_patch(Rectangle((x, y), raft, raft, fill=False, edgecolor="0.6", linestyle=":", linewidth=0.9))
             axes.annotate(
-                "wavefront and\nguide sensors\n(not modelled)",
+                "wavefront and\nguide sensors\n(not drawn)",
                 (x + 0.5 * raft, y + 0.5 * raft),
                 ha="center",
                 va="center",
@@ -177,7 +177,7 @@ def _draw_corner_rafts(axes: Axes, camera: Camera) -> None:
     "fig2",
     "encircled energy over the field",
     "80 % radius within about 7 % of the mean to 1.4°, at most about 17 % off, at 1.75° (i band, no atmosphere)",
-    minutes=(0.2, 1.5),
+    minutes=(0.3, 1.5),
 )
 def encircled_energy_over_field(bench: Bench) -> Reproduced:
     """Measure the encircled energy of diffraction-limited PSFs over the field, i band (Fig. 2).

@@ -78,7 +78,7 @@ def eigen_psfs(bench: Bench) -> Reproduced:
     "fig11",
     "whiskers with the atmosphere",
     "the pattern of the optics alone (Fig. 8), smaller: the atmosphere makes PSFs rounder; heights still show",
-    minutes=(0.2, 0.6),
+    minutes=(0.03, 0.6),
     of_run=True,
 )
 def whiskers_of_stars(bench: Bench) -> Reproduced:

@@ -26,7 +26,7 @@ _FIGURES = [value for module in _MODULES for value in vars(module).values() if i
 #: Figures and tables in the order of the paper.
 FIGURES = {figure.name: figure for figure in sorted(_FIGURES, key=_number)}
 # Approximate time of the run, of the visits and of their galaxies, at the scales `small` and `paper` [min].
-_SHARED_MINUTES = {"of_run": (0.5, 24.0), "of_visits": (0.4, 90.0), "of_galaxies": (0.6, 600.0)}
+_SHARED_MINUTES = {"of_run": (0.2, 24.0), "of_visits": (0.2, 90.0), "of_galaxies": (0.7, 600.0)}
 _ALL = "all"
 
 

@@ -21,6 +21,7 @@ def run_summary(ccds=9, lost=(), **changes):
     metrics = {
         "ccds": ccds,
         "fwhm_arcsec": 0.684,
+        **{"truth_psfs": 900, "truth_psfs_with_g": 899},
         **{"mean_g_truth": 0.023, "rms_residual_g_away": 0.004, "rms_scatter_g": 0.009},
         **{"mean_e_truth": 0.011, "rms_residual_away": 0.002, "rms_scatter_e": 0.0045},
         **changes,
@@ -46,6 +47,12 @@ def run_summary(ccds=9, lost=(), **changes):
             run_summary(mean_g_truth=NAN, fwhm_arcsec=NAN),
             "On 9 CCDs the PSF is of unknown width with a mean ellipticity |weighted e| of 1.10 %; where no star is, "
             "its model errs by 0.20 % in weighted e, against 0.45 % of a constant PSF on each CCD.",
+        ),
+        # The mean of the few that are wide enough is not that of the PSFs.
+        (
+            run_summary(truth_psfs_with_g=880, mean_g_truth=0.17),
+            'On 9 CCDs the PSF is 0.684" wide with a mean ellipticity |weighted e| of 1.10 %; where no star is, its '
+            "model errs by 0.20 % in weighted e, against 0.45 % of a constant PSF on each CCD.",
         ),
     ],
 )
@@ -222,6 +229,10 @@ STACKS = {
         (
             verdicts.shim_verdict("fwhm", "rafts", SimpleNamespace(fwhm=0.7), SimpleNamespace(fwhm=0.69)),
             "Shims of rafts lower the mean FWHM: 0.7 arcsec focused as a whole, 0.69 arcsec with them.",
+        ),
+        (
+            verdicts.shim_verdict("ellipticity", "ccds", SimpleNamespace(rms_g=0.008), SimpleNamespace(rms_g=0.004)),
+            "Shims of CCDs lower the rms of g: 8e-3 focused as a whole, 4e-3 with them.",
         ),
         (
             verdicts.reproduced_verdict({"fig1": {"verdict": "agrees"}, "fig2": {"verdict": "differs"}}),

@@ -180,6 +180,26 @@ def test_kinds_of_configurations_name_the_commands_that_take_set():
     assert {command.partition(" --")[0] for command in stated} == taking
 
 
+def settings_shown():
+    """Keys that examples of help and documentation set, with the kind of configuration of their command."""
+    kinds = {
+        command.partition(" --")[0]: name
+        for name, kind in reversed(config_kinds.KINDS.items())
+        for command in kind.commands.split(", ")
+    }
+    docs = (path.read_text(encoding="utf-8") for path in (Path(__file__).parents[2] / "docs").rglob("*.md"))
+    for text in (*(command.help or "" for command in COMMANDS.values()), *docs):
+        for line in re.findall(r"^.*\bpachon (?:.*) --set .*$", text, flags=re.M):
+            command = max((c for c in kinds if re.search(rf"\bpachon {c}\b", line)), key=len, default=None)
+            for key in re.findall(r"--set ([\w.]+)=", line) if command else ():
+                yield "night" if " --list " in line and command == "visits" else kinds[command], key
+
+
+@pytest.mark.parametrize(("kind", "key"), sorted(set(settings_shown())))
+def test_keys_that_examples_set_exist(kind, key, capsys):
+    assert main(["config", f"{kind}.{key}"]) == 0
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_at_80_columns_is_not_cut_and_has_no_types_of_python(name, capsys, monkeypatch):

@@ -6,6 +6,7 @@ import inspect
 import io
 import re
 import shutil
+from decimal import Decimal
 from pathlib import Path
 
 import matplotlib
@@ -91,8 +92,10 @@ def test_examples_run(name, tmp_path, monkeypatch, capsys):
 
 
 def number_and_words(text):
-    """Split text into its words and its numbers."""
-    return re.sub(NUMBER, "#", text), [float(number) for number in re.findall(NUMBER, text)]
+    """Split text into its words, its numbers and the units of their last digits."""
+    numbers = re.findall(NUMBER, text)
+    last_digits = [10.0 ** Decimal(number).as_tuple().exponent for number in numbers]
+    return re.sub(NUMBER, "#", text), np.array(numbers, dtype=float), np.array(last_digits)
 
 
 @pytest.mark.long
@@ -105,17 +108,17 @@ def test_lessons_print_what_they_show(name, tmp_path, monkeypatch):
 
 
 def check_shown(name):
-    """Run the blocks of a page; each prints the words of the text block after it, and numbers within a fifth."""
+    """Run the blocks of a page; each prints the words of the text block after it, and its numbers."""
     names = {}
     with matplotlib.rc_context():
         for block, shown in re.findall(r"```python\n(.*?)```\n(?:\n```text\n(.*?)```)?", PAGES[name], flags=re.S):
             with contextlib.redirect_stdout(io.StringIO()) as printed:
                 exec(compile(block, name, "exec"), names)
-            words, numbers = number_and_words(printed.getvalue())
-            expected_words, expected = number_and_words(shown)
+            words, numbers, _ = number_and_words(printed.getvalue())
+            expected_words, expected, last_digits = number_and_words(shown)
             assert words.split() == expected_words.split()
             # Processors differ in last digits alone, and printed roundings may flip.
-            np.testing.assert_allclose(numbers, expected, rtol=0.2, atol=2e-3)
+            assert np.all(np.abs(numbers - expected) <= 1.5 * last_digits), (numbers, expected)
 
 
 @pytest.mark.long
@@ -131,6 +134,14 @@ def test_the_page_of_an_own_telescope_runs_on_its_file(tmp_path, monkeypatch):
     (tmp_path / "corrected.yaml").write_text(text, encoding="utf-8")
     assert CliRunner().invoke(app, ["validate", "corrected.yaml"]).exit_code == 0
     check_shown("own_telescope.md")
+    # The camera file that the page leads to has its CCDs where this telescope's light falls.
+    camera_file = re.search(r"```yaml\n(# my_camera.yaml.*?)```", PAGES["camera.md"], flags=re.S)[1]
+    (tmp_path / "my_camera.yaml").write_text(camera_file, encoding="utf-8")
+    camera, telescope = pachon.load_camera("my_camera.yaml"), pachon.load_telescope("corrected.yaml")
+    corners = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+    pixels = (np.arange(len(camera))[:, None], (camera.pixels[:, None] - 1) * corners)
+    fields = pachon.fields_at(telescope, camera.from_pixel(*pixels).reshape(-1, 2))
+    assert (pachon.vignetting(telescope, fields).lit_fraction > 0.5).all()
     assert (tmp_path / "my_psfs.png").read_bytes().startswith(b"\x89PNG")
 
 

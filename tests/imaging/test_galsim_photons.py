@@ -453,3 +453,29 @@ def test_the_psf_of_the_focal_plane_becomes_an_object(gaussian, monkeypatch):
     assert moments == pytest.approx(covariance_of["R22_S11"], abs=0.03)
     with pytest.raises(DomainError, match="ccd, x and y: expected the place"):
         pachon.galsim.psf_object(model, x=1e-3, y=0.0)
+
+
+@pytest.mark.parametrize(
+    ("telescope", "ccd"), [("lsst_v3.3_r", "R22_S12"), ("comcam_r", "R22_S01"), ("hsc", "hsc074"), ("hsc", "hsc101")]
+)
+def test_a_stamp_along_the_focal_plane_is_turned_onto_the_pixels_as_photons_are(stamp, telescope, ccd):
+    model = pachon.load_telescope(telescope)
+    camera = pachon.load_camera(model.camera)
+    middle = 0.5 * (camera.pixels[camera.ccd_index(ccd)] - 1.0)
+    field = pachon.fields_at(model, camera.from_pixel(camera.ccd_index(ccd), middle)[None])[0]
+    axes = ({}, {"ccd": ccd, "image_pos": galsim.PositionD(*(middle + 1.0))})
+    ends = [photons(60, band=(620.0, 621.0)) for _ in axes]
+    for landed, options in zip(ends, axes, strict=True):
+        pachon.galsim.PachonOptics(model, field, **options).applyTo(landed)
+    along = [np.stack([p.x - p.x.mean(), p.y - p.y.mean()]) for p in ends]
+    turn = np.round(along[1] @ np.linalg.pinv(along[0]), 6)
+
+    local = pachon.galsim.galsim_wcs(ccd_wcs(model, camera, ccd, pointing=POINTING)).local(
+        galsim.PositionD(*(middle + 1.0))
+    )
+    psf = pachon.galsim.psf_object(psfs_of(stamp), camera=model.camera, ccd=ccd, wcs=local)
+    _, moments = covariance(psf.drawImage(nx=61, ny=61, wcs=local, method="no_pixel").array)
+    assert moments == pytest.approx(turn @ np.array([[9.0, 2.0], [2.0, 5.0]]) @ turn.T, abs=5e-2)
+    for options in ({"ccd": ccd}, {"wcs": local}, {"ccd": ccd, "wcs": 0.2}):
+        with pytest.raises(DomainError, match=r"camera = .*: expected ccd and the local WCS of its pixels beside it"):
+            pachon.galsim.psf_object(psfs_of(stamp), camera=camera, **options)

@@ -37,6 +37,8 @@ def test_one_measured_psf_of_a_ccd_has_no_scatter(finished_run):
     assert np.isnan(scatter([one], "g"))
     assert np.isnan(size_scatter([one]))
     assert scatter([one, product], "g") == scatter([product], "g")
+    metrics = run_metrics([one, product], {})["all"]
+    assert metrics["truth_psfs_with_g"] == metrics["truth_psfs"] // 2 + 1
 
 
 def test_no_pairs_within_a_range_give_no_mean():

@@ -92,6 +92,7 @@ def test_bundled_baselines_pass(capsys):
     assert main(["check", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["passed"] is True
+    assert [b["notes"] for b in result["baselines"]] == [[], []]
     assert [b["model"] for b in result["baselines"]] == ["lsst_v3.3_g_vacuum_zemax_check", "lsst_v3.3_r"]
     assert max(d["deviation_over_tolerance"] for b in result["baselines"] for d in b["deviations"]) < 0.3
 

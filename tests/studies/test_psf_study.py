@@ -17,6 +17,7 @@ from pachon.pipeline.simulate.ccd_exposure import CcdExposure, NoiseFreeStars
 from pachon.pipeline.simulate.ccd_observation import Observation
 from pachon.pipeline.simulate.star_field import CcdOutline, Depth, make_star_field
 from pachon.reconstruction.psf_model.polynomial import mapped
+from pachon.reconstruction.psf_model.recipe import DEFAULT
 from pachon.studies.psf_choice.plan import NOISE_FREE, PROCESSES, Case, Plan, make_plan
 from pachon.studies.psf_choice.residuals import case_metrics, measure_residuals, noise_law, residual_correlations
 from pachon.studies.psf_choice.stars import SimulatedCcd, fit, observe, simulate
@@ -252,6 +253,16 @@ def test_plan_of_a_configuration(tiny):
 def small(tiny):
     plan = make_plan(tiny(), stars=(6,), orders=(1, 3), components=(4,), snrs=(30.0,), draws=2)
     return plan, study(tiny(), plan, threads=1)
+
+
+def test_cases_about_the_default_model_have_recipes():
+    """As of the config.yaml of a run, which names pixels and kriging: components are those of other bases alone."""
+    base = Case.of_recipe(40, 30.0, DEFAULT)
+    cases = Plan(base, (30, 40), (1, 2), (5, 20), (30.0,)).cases()
+    assert base in cases
+    counts = {(basis, count) for basis in ("pca", "shapelets") for count in (5, 20)}
+    assert {(case.basis, case.components) for case in cases} == {("pixels", 0), *counts}
+    assert all(case == Case.of_recipe(case.stars, case.snr, case.recipe()) for case in cases if case.snr != NOISE_FREE)
 
 
 def test_every_case_has_figures_or_a_problem(small):

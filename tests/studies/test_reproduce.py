@@ -88,6 +88,7 @@ def test_figures_of_visits_are_those_of_their_folder(few_galaxies, tmp_path):
     assert summary["fig15"]["measured"]["rms_e_2"] == pytest.approx(stacks["2"]["rms_e"], rel=1e-8)
     galaxies = json.loads((tmp_path / "visits" / "null_test.json").read_text())["stacks"]
     assert summary["fig17"]["measured"]["usable_per_arcmin2_1"] == pytest.approx(galaxies["1"]["usable_per_arcmin2"])
+    assert ", without an error, beyond 10' in 2 visits" in summary["fig17"]["here"]
     assert list(table(bench, "fig18.ecsv")["visits"]) == [1, 2]
     assert summary["fig10"]["measured"]["limit_6000s_mag"] > summary["fig10"]["measured"]["limit_one_exposure_mag"] + 3
 

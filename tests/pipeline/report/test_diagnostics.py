@@ -1,10 +1,14 @@
+import itertools
 import json
+import re
 import shutil
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
 
 from pachon.commands.cli import main
 from pachon.core.errors import ProductError
@@ -14,9 +18,9 @@ from pachon.measure.correlation_plots import rho_plot
 from pachon.measure.rho_statistics import rho_statistics
 from pachon.measure.shapes import measure_shapes
 from pachon.models.camera.cameras import load_camera
-from pachon.pipeline.report import diagnostics
+from pachon.pipeline.report import diagnostics, focal_plane_plots
 from pachon.pipeline.report.diagnostics import FOLDER_NAME, diagnose
-from pachon.pipeline.report.focal_plane_plots import residual_plot
+from pachon.pipeline.report.focal_plane_plots import RESIDUAL_TITLES, residual_plot
 from pachon.pipeline.summary import separation_bins
 from pachon.reconstruction.ccd_product import KINDS, product_path, read_product
 
@@ -283,6 +287,26 @@ def test_pictures_of_ccds_without_figures(diagnosed):
         if name.startswith(("mean", "rms")):
             figures[name][:] = 0.0
     assert residual_plot(camera, figures).startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("names", [["R22_S11"], ["R22_S11", "R24_S12"], ["R21_S11", "R22_S11", "R32_S11"]])
+def test_no_words_of_the_picture_of_residuals_overlap(names, monkeypatch):
+    monkeypatch.setattr(focal_plane_plots, "png_bytes", lambda figure: figure)
+    camera = load_camera("lsst")
+    kinds = [f"{what}_{kind}" for what in ("rms_e", "mean_e1", "mean_e2", "mean_dt") for kind in RESIDUAL_TITLES]
+    columns = dict.fromkeys(kinds, np.full(len(names), 0.002))
+    x, y = 1e3 * camera.centers[[camera.ccd_index(name) for name in names]].T
+    figure = residual_plot(camera, {**columns, "ccd": np.array(names), "x_mm": x, "y_mm": y})
+    figure.draw_without_rendering()
+    words = [text for text in figure.findobj(Text) if re.search("[a-z%]", text.get_text())]
+    boxes = [text.get_window_extent() for text in words]
+    assert [
+        (words[i].get_text(), words[j].get_text())
+        for i, j in itertools.combinations(range(len(words)), 2)
+        if Bbox.intersection(boxes[i], boxes[j]) is not None
+    ] == []
+    outer = figure.bbox
+    assert all(outer.x0 <= box.x0 and box.x1 <= outer.x1 and box.y1 <= outer.y1 for box in boxes)
 
 
 @pytest.mark.long

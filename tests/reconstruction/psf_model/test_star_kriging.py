@@ -300,6 +300,18 @@ def test_few_stars_noise_free_ones_and_equal_ones_are_no_trouble():
     np.testing.assert_allclose(same.at(elsewhere[20:22]), np.repeat(truth[:1], 2, axis=0), atol=1e-12)
 
 
+@pytest.mark.parametrize("count", [40, 160])
+@pytest.mark.parametrize("electrons", [1e3, 1e5])
+def test_noise_free_stars_have_no_more_than_the_changes_of_their_psf(count, electrons):
+    """Their photon noise is counted, though not there. Stars near a line of shapes show nothing across it."""
+    points = np.random.default_rng(1).uniform(-1.0, 1.0, (count + 100, 2))
+    height = 0.003 * points[:, 0] + 0.004 * ((points**2).sum(axis=1) - 0.6)  # as of a focus
+    images = psfs(0.8 * height, 0.3 * height, 1.5 * (1.0 + height))
+    model = PsfModel.fit(electrons * images[:count], points[:count], **OPTIONS)
+    truth = images[count:]
+    assert np.abs(model.at(points[count:]) - truth).max() < 1.5 * np.abs(truth - truth.mean(axis=0)).max()
+
+
 def test_stamps_that_are_not_in_electrons_are_noticed():
     stars, places, _, _ = field(3, 12, 0.0)
     unit = stars / stars.sum(axis=(1, 2), keepdims=True)

@@ -1,6 +1,7 @@
 """Figures of tiles: counts and slopes known beforehand, and a small stack with noise."""
 
 import json
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -179,3 +180,13 @@ def test_images_with_too_few_stars_are_kept(visit_products, small_visits, tmp_pa
     assert (folder / "images.png").exists()
     assert main([*command, "--resume", "--no-measure"]) == 0
     assert {path.name: path.read_bytes() for path in folder.glob("*.fits")} == kept
+
+
+def test_examples_of_help_measure_no_tiles_with_too_few_stars(capsys, monkeypatch):
+    """A tile without a stellar locus, of five bright stars, ends the command; a CCD has forty stars by default."""
+    monkeypatch.setenv("COLUMNS", "200")
+    assert main(["stack-images", "--help"]) == 0
+    examples = re.findall(r"pachon stack-images .*--side (\d+)(.*)", capsys.readouterr().out)
+    assert examples
+    for side, others in examples:
+        assert 40 * (int(side) / 4000) ** 2 > 5 or "--no-measure" in others
