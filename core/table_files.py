@@ -14,6 +14,7 @@ import numpy as np
 from astropy import units as u
 from astropy.io import fits
 from astropy.table import Column, Table
+from astropy.table.meta import get_header_from_yaml
 from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
 from .errors import ConfigError, PachonError, ProductError
@@ -53,7 +54,10 @@ def read_columns(path: Path) -> dict[str, Column | np.ndarray]:
         with parsing(path, f"damaged or no {kind.removeprefix('ascii.').upper()} table", ProductError):
             if kind == "parquet":
                 content = parquet_module(path, ProductError).read_table(io.BytesIO(data))
-                columns = {name.lower(): content[name].to_numpy() for name in content.column_names}
+                units = _parquet_units(content.schema)
+                columns = {
+                    name.lower(): _with_unit(content[name].to_numpy(), units.get(name)) for name in content.column_names
+                }
                 return columns | {
                     name: Column(columns[heading], unit=unit)
                     for name, (heading, unit) in _names_in_headings(columns).items()
@@ -85,6 +89,21 @@ def column_in_unit(columns: Mapping[str, Any] | Table, name: str, unit: u.UnitBa
         raise ProductError(f"column {name!r} in {column_unit}: expected a unit that converts to {unit}")
     quantity = u.Quantity(numbers, column_unit or unit)
     return metres(quantity, f"column {name}") if unit == u.m else radians(quantity, f"column {name}")
+
+
+def _with_unit(values: np.ndarray, unit: str | None) -> Column | np.ndarray:
+    """Return values as a column with a unit, as they are without."""
+    return values if unit is None else Column(values, unit=u.Unit(unit, parse_strict="silent"))
+
+
+def _parquet_units(schema: Any) -> dict[str, str]:
+    """Return the units of columns of Parquet that state one: fields of this package, or the header of astropy."""
+    units = {field.name: field.metadata[b"unit"].decode() for field in schema if b"unit" in (field.metadata or {})}
+    header = (schema.metadata or {}).get(b"table_meta_yaml")
+    if header is not None:
+        described_columns = get_header_from_yaml(header.decode().splitlines())["datatype"]
+        units |= {column["name"]: column["unit"] for column in described_columns if "unit" in column}
+    return {name: unit for name, unit in units.items() if unit}
 
 
 def text_table(data: bytes, kind: str = "ascii.csv") -> Table:
