@@ -46,6 +46,8 @@ FOLDS = 5
 _SKY = 0.4
 # Rim of a stamp that a shift may bring in from the other side [pixel].
 _RIM = 2
+# Least side of a PSF [pixel].
+_LEAST_SIZE = 9
 # Defects that may be masked in a star that stays.
 _MASKABLE = StarFlag.NEIGHBOUR | StarFlag.COSMIC_RAY
 
@@ -121,10 +123,13 @@ def fit_own_stars(
     if not (np.isfinite(gain) and gain > 0.0):
         raise DomainError(f"gain = {gain}: expected a number of electrons above 0")
     side = min(raw_images.shape[1:])
+    if size is None and side < _LEAST_SIZE + 2 * _RIM:
+        raise DomainError(f"stamps of {side} pixels along a side: expected at least {_LEAST_SIZE + 2 * _RIM}, or size")
     if size is None:
-        size = max(side - 2 * _RIM - 1 + (side % 2), 0)
-    if size % 2 == 0 or not 9 <= size <= side:
-        raise DomainError(f"size = {size}: expected an odd number of pixels from 9 to {side}, the side of the stamps")
+        size = side - 2 * _RIM - 1 + (side % 2)
+    if size % 2 == 0 or not _LEAST_SIZE <= size <= side:
+        limits = f"{_LEAST_SIZE} to {side}, the side of the stamps"
+        raise DomainError(f"size = {size}: expected an odd number of pixels from {limits}")
 
     def less_sky(bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         level, rms = sky_of_stamps(raw_images, bad, _SKY * side)

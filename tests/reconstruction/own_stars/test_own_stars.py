@@ -107,6 +107,17 @@ def test_clipped_stars_are_left_out_without_a_level_of_saturation(stars, own):
     assert not clipped_stars(np.ones((5, 9, 9)), np.zeros((5, 9, 9), dtype=bool)).any()
 
 
+def test_stars_of_which_most_are_clipped_at_one_level_are_not_without_noise(stars):
+    peaks = stars.stamps.max(axis=(1, 2))
+    level = np.quantile(peaks, 0.3)
+    clipped = clipped_stars(np.minimum(stars.stamps, level), np.zeros(stars.stamps.shape, dtype=bool))
+    assert clipped.tolist() == (peaks >= level).tolist()
+    # Symmetric stars without noise have four equal pixels each.
+    squares = np.add.outer(*2 * [(np.arange(8) - 3.5) ** 2])
+    symmetric = np.exp(-0.2 * squares) * np.ones((9, 1, 1))
+    assert not clipped_stars(symmetric, np.zeros(symmetric.shape, dtype=bool)).any()
+
+
 def test_residuals_of_held_out_stars_are_their_noise(own):
     d1, d2, size = own.residuals()
     assert 0.8 < np.std(np.concatenate([d1, d2]) / np.tile(own.sigma_e, 2)) < 1.35
@@ -228,6 +239,8 @@ def test_stars_that_sextractor_flags_are_left_out(stars, tmp_path, monkeypatch, 
 def test_bad_values_are_named(stars, change, message):
     with pytest.raises(DomainError, match=message):
         fit_own_stars(*stars, **({"pixel_scale": PIXEL} | change))
+    with pytest.raises(DomainError, match="stamps of 7 pixels along a side: expected at least 13, or size"):
+        fit_own_stars(stars.stamps[:, :7, :7], stars.positions, PIXEL)
 
 
 def test_options_of_the_model_are_checked(stars):
