@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, Unpack
 
@@ -14,7 +15,7 @@ from ...core.errors import DomainError
 from ...core.number_text import counted
 from ...core.random_streams import stream
 from ...core.statistics import finite_median, median_image
-from ...core.units import positive_angle, real_array, require_seed
+from ...core.units import positive_angle, real_array, require_positive, require_seed
 from ...measure.pixel_masks import clipped_stars, fill_symmetric
 from ...measure.shapes import fwhm, measure_shapes
 from ...measure.stamps import center_masks, decenter_masks, shift_to_middle
@@ -120,8 +121,9 @@ def fit_own_stars(
     if bad.size and bad.all():
         raise DomainError(f"no pixel of {len(bad)} stamps has weight: all are masked, or no numbers")
     scale = positive_angle(pixel_scale, "pixel_scale")
-    if not (np.isfinite(gain) and gain > 0.0):
-        raise DomainError(f"gain = {gain}: expected a number of electrons above 0")
+    require_positive(gain, "gain", "electrons")
+    if math.isnan(min_snr):
+        raise DomainError("min_snr = nan: expected the least S/N of a star")
     side = min(raw_images.shape[1:])
     if size is None and side < _LEAST_SIZE + 2 * _RIM:
         raise DomainError(f"stamps of {side} pixels along a side: expected at least {_LEAST_SIZE + 2 * _RIM}, or size")
