@@ -59,12 +59,12 @@ def stack_images_command(
     - `pachon stack-images deep --side 1024 --no-measure`: only 3.4 arcminutes, too few stars to measure, a few minutes
     - `pachon stack-images deep --resume`: go on where it was stopped, or with the visits added since
     """
+    from ..pipeline.config import with_options
     from ..studies.visits.image_stack.config import ImageStackConfig
     from ..studies.visits.image_stack.measure import measure_stack
     from ..studies.visits.image_stack.stack_images import stack_images
 
-    overrides = {"tiles": tiles, "faintest": faintest, "side": side, "noise": noise}
-    settings = ImageStackConfig(**{key: value for key, value in overrides.items() if value is not None})
+    settings = with_options(ImageStackConfig(), tiles=tiles, faintest=faintest, side=side, noise=noise)
     if table is not None and not measure:
         raise ConfigError("--table with --no-measure: expected one of them, without galaxies there is no table")
     hint = f"finished visits are in {folder}, and --resume goes on from there"

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from astropy import units as u
 from astropy.io import fits
-from astropy.table import Column, Table
+from astropy.table import Column, MaskedColumn, Table
+from astropy.table.meta import get_header_from_yaml
 from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
 from .errors import ConfigError, PachonError, ProductError
@@ -53,9 +54,9 @@ def read_columns(path: Path) -> dict[str, Column | np.ndarray]:
         with parsing(path, f"damaged or no {kind.removeprefix('ascii.').upper()} table", ProductError):
             if kind == "parquet":
                 content = parquet_module(path, ProductError).read_table(io.BytesIO(data))
-                columns = {name.lower(): content[name].to_numpy() for name in content.column_names}
+                columns = _parquet_columns(content)
                 return columns | {
-                    name: Column(columns[heading], unit=unit)
+                    name: _with_unit(columns[heading], unit)
                     for name, (heading, unit) in _names_in_headings(columns).items()
                 }
             table = Table.read(io.BytesIO(data), format=kind) if kind == "fits" else text_table(data, kind)
@@ -85,6 +86,37 @@ def column_in_unit(columns: Mapping[str, Any] | Table, name: str, unit: u.UnitBa
         raise ProductError(f"column {name!r} in {column_unit}: expected a unit that converts to {unit}")
     quantity = u.Quantity(numbers, column_unit or unit)
     return metres(quantity, f"column {name}") if unit == u.m else radians(quantity, f"column {name}")
+
+
+def _parquet_columns(content: Any) -> dict[str, Column | np.ndarray]:
+    """Return the columns of a table of Parquet by their names in small letters, with units and masks that it states."""
+    units, columns = _parquet_units(content.schema), {}
+    # astropy writes the mask of a column as another column.
+    masks = {f"{name}.mask" for name in content.column_names}.intersection(content.column_names)
+    for name in content.column_names:
+        values = content[name].to_numpy()
+        if f"{name}.mask" in masks:
+            values = MaskedColumn(values, mask=content[f"{name}.mask"].to_numpy())
+        if name in units:
+            values = _with_unit(values, u.Unit(units[name], parse_strict="silent"))
+        if name not in masks:
+            columns[name.lower()] = values
+    return columns
+
+
+def _with_unit(values: np.ndarray, unit: u.UnitBase) -> Column:
+    """Return values as a column with a unit, masked where they are."""
+    return (MaskedColumn if isinstance(values, MaskedColumn) else Column)(values, unit=unit)
+
+
+def _parquet_units(schema: Any) -> dict[str, str]:
+    """Return the units of columns of Parquet that state one: fields of this package, or the header of astropy."""
+    units = {field.name: field.metadata[b"unit"].decode() for field in schema if b"unit" in (field.metadata or {})}
+    header = (schema.metadata or {}).get(b"table_meta_yaml")
+    if header is not None:
+        described_columns = get_header_from_yaml(header.decode().splitlines())["datatype"]
+        units |= {column["name"]: column["unit"] for column in described_columns if "unit" in column}
+    return {name: unit for name, unit in units.items() if unit}
 
 
 def text_table(data: bytes, kind: str = "ascii.csv") -> Table:

@@ -76,7 +76,7 @@ def positions_in(table: Table, image: CcdImage, path: Path) -> np.ndarray:
 def table_in(path: Path) -> Table:
     """Read a table; of a FITS file the first one with a position, as LDAC files have others before it."""
     data = read_bytes(path, ProductError)
-    with warnings.catch_warnings(), parsing(path, "no table of stars", ProductError):
+    with warnings.catch_warnings(), parsing(path, "no table of stars in FITS, ECSV or CSV", ProductError):
         warnings.simplefilter("ignore")
         if not data.startswith(b"SIMPLE"):
             return text_table(data)

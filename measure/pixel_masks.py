@@ -21,6 +21,8 @@ _MASKED = -1e29
 _COPIES = 3
 #: Pixels of exactly the greatest value of a star that make it clipped.
 _FLAT = 3
+#: Most pixels about the centre of a star without noise that have its greatest value.
+_EQUAL_BY_SYMMETRY = 4
 # Fewest rows of theirs: of whole numbers with a noise of 1 so many agree by chance once in ten thousand stamps.
 _COPIED_LENGTH = 12
 # Standard deviation of the weights of good neighbours [pixel], about the width of a star.
@@ -74,14 +76,17 @@ def clipped_stars(images: np.ndarray, bad: NDArray[np.bool_]) -> NDArray[np.bool
 
     Saturated pixels are clipped at one level, which noise does not repeat: three or more pixels of a stamp have exactly
     its greatest value, and that is more than half of the greatest of all stamps. Stars that reach such a level in fewer
-    pixels are clipped, too. Where most stars seem so, they are images without noise.
+    pixels are clipped, too. Where most stars seem so, they are images without noise, whose symmetry makes four pixels
+    equal; or most are clipped: at one level, in more pixels than that.
     """
     values = np.where(bad, -np.inf, images)
     greatest = values.max(axis=(1, 2), initial=-np.inf)
     equal = (values == greatest[:, None, None]).sum(axis=(1, 2))
     flat = (equal >= _FLAT) & np.isfinite(greatest) & (greatest > 0.5 * greatest.max(initial=-np.inf))
     if 2 * flat.sum() > len(flat):
-        return np.zeros(len(flat), dtype=bool)
+        plateaus = flat & (equal > _EQUAL_BY_SYMMETRY) & (2 * equal < values[0].size)
+        levels, counts = np.unique(greatest[plateaus], return_counts=True)
+        flat = plateaus & np.isin(greatest, levels[2 * counts > flat.sum()])
     return np.isin(greatest, greatest[flat])
 
 

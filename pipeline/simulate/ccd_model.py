@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from ...core.errors import PachonError, attempt
+from ...core.errors import DomainError, PachonError, attempt
 from ...core.groups import rows_of, slices_of
 from ...core.statistics import FWHM_PER_RMS
 from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
@@ -279,6 +279,13 @@ def _product(experiment: Experiment, compared: _ComparedCcd, jacobians: Sequence
     def shapes_of(images: np.ndarray) -> Shapes:
         return measure_shapes(images, observed.pixel_scale, experiment.weight_fwhm)
 
+    model_shapes = shapes_of(modelled.holdout_models)
+    stamp = f"{experiment.stamp_size} x {experiment.stamp_size} pixels (psf.stamp)"
+    if not holdout_shapes.usable.any():
+        raise DomainError(f"no noise-free PSF has a shape on {stamp}: expected sharper ones, or more pixels")
+    if not model_shapes.usable.any():
+        reason = f"the PSF model has no shape, faint stars are lost in the noise of {stamp}"
+        raise DomainError(f"{reason}: expected brighter stars (stars.snr_min), or fewer pixels")
     left_out_models = model.leave_one_out()
     left_out_moments = _adaptive_of(experiment, [left_out_models], observed.pixel_scale)[0]
     x, y = experiment.camera.centers[experiment.camera.ccd_index(name)]
@@ -290,7 +297,7 @@ def _product(experiment: Experiment, compared: _ComparedCcd, jacobians: Sequence
         noise=observation.noise,
         holdout=HoldoutStars(
             **_position_columns(experiment, positions.holdout, holdout.fields),
-            **_shape_columns(holdout_shapes, shapes_of(modelled.holdout_models)),
+            **_shape_columns(holdout_shapes, model_shapes),
             **_adaptive_columns(*compared.holdout),
             **_sky_columns(holdout_axes, holdout_shapes, compared.holdout[0]),
             fwhm=fwhm(holdout.image, holdout.pixel_scale),

@@ -26,12 +26,18 @@ _STEP = 0.02
 _ITERATIONS = 7
 # Least square of a step for an update of the Jacobian.
 _SMALLEST = 1e-14
+# Depth of dark rings about a star, of its peak, from which on they are of no PSF.
+_RINGING = 0.1
 # Pixels of zeros about a stamp while it is convolved.
 _ROOM = 8
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def with_shapes(images: np.ndarray, values: np.ndarray, pixel_scale: float, weight_fwhm: float) -> np.ndarray:
-    """Convolve images [n, ny, nx] to the shapes e1, e2, ln size [n, 3]; the result is centred and of unit sum."""
+    """Convolve images [n, ny, nx] to the shapes e1, e2, ln size [n, 3]; the result is centred and of unit sum.
+
+    Where no image has the shape (:func:`has_shape`), it is of another one, or not finite.
+    """
     ny, nx = images.shape[1:]
     padded = np.pad(images.astype(np.float64), ((0, 0), (_ROOM, _ROOM), (_ROOM, _ROOM)))
     spectrum = np.fft.rfft2(padded)
@@ -70,6 +76,16 @@ def with_shapes(images: np.ndarray, values: np.ndarray, pixel_scale: float, weig
         jacobian[moved] += missed[moved, :, None] * (step / np.maximum(square, _SMALLEST)[:, None])[moved, None]
     result = image(amounts, shift)
     return result / result.sum(axis=(1, 2), keepdims=True)
+
+
+def has_shape(images: np.ndarray) -> np.ndarray:
+    """Return which images of :func:`with_shapes` [n, ny, nx] have theirs, bool [n].
+
+    A shape far from that of the image, as noise makes them of faint stars, needs a Gaussian of so negative a width that
+    rings outshine the star, or that the search ends in no image at all.
+    """
+    darkest, brightest = images.min(axis=(1, 2)), images.max(axis=(1, 2))
+    return np.asarray(np.isfinite(images).all(axis=(1, 2)) & (darkest > -_RINGING * brightest))
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ from .field import ShapeField
 from .field_fit import LEAST_STARS, FittedField, fit_field, height_prior, mosaic_of
 from .file import ModelFields, model_hdus, read_model
 from .fit import SHAPES, ShapeData, Turbulence
-from .images import ResidualImages, with_shapes
+from .images import ResidualImages, has_shape, with_shapes
 from .layer_covariance import LayerCovariance
 from .mosaic import Mosaic, PsfShapes
 from .optics_prior import OpticsPrior
@@ -360,7 +360,11 @@ class FocalPlanePsf(ModelFields, Result):
             return model
         with reporter.stage("residual stamps"):
             plain = model._draw_places(places, self.field.data.values[finite], threads)
-            pca = ResidualImages.fit(stamps - plain, places, weight, self.field.mosaic, components, threads)
+            reached = has_shape(plain)
+            if not reached.any():
+                return model
+            residuals, stars = (stamps - plain)[reached], (places[reached], weight[reached])
+            pca = ResidualImages.fit(residuals, *stars, self.field.mosaic, components, threads)
         return replace(model, pca=pca)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, Unpack
 
@@ -14,7 +15,7 @@ from ...core.errors import DomainError
 from ...core.number_text import counted
 from ...core.random_streams import stream
 from ...core.statistics import finite_median, median_image
-from ...core.units import positive_angle, real_array, require_seed
+from ...core.units import positive_angle, real_array, require_positive, require_seed
 from ...measure.pixel_masks import clipped_stars, fill_symmetric
 from ...measure.shapes import fwhm, measure_shapes
 from ...measure.stamps import center_masks, decenter_masks, shift_to_middle
@@ -46,6 +47,8 @@ FOLDS = 5
 _SKY = 0.4
 # Rim of a stamp that a shift may bring in from the other side [pixel].
 _RIM = 2
+# Least side of a PSF [pixel].
+_LEAST_SIZE = 9
 # Defects that may be masked in a star that stays.
 _MASKABLE = StarFlag.NEIGHBOUR | StarFlag.COSMIC_RAY
 
@@ -118,13 +121,17 @@ def fit_own_stars(
     if bad.size and bad.all():
         raise DomainError(f"no pixel of {len(bad)} stamps has weight: all are masked, or no numbers")
     scale = positive_angle(pixel_scale, "pixel_scale")
-    if not (np.isfinite(gain) and gain > 0.0):
-        raise DomainError(f"gain = {gain}: expected a number of electrons above 0")
+    require_positive(gain, "gain", "electrons")
+    if math.isnan(min_snr):
+        raise DomainError("min_snr = nan: expected the least S/N of a star")
     side = min(raw_images.shape[1:])
+    if size is None and side < _LEAST_SIZE + 2 * _RIM:
+        raise DomainError(f"stamps of {side} pixels along a side: expected at least {_LEAST_SIZE + 2 * _RIM}, or size")
     if size is None:
-        size = max(side - 2 * _RIM - 1 + (side % 2), 0)
-    if size % 2 == 0 or not 9 <= size <= side:
-        raise DomainError(f"size = {size}: expected an odd number of pixels from 9 to {side}, the side of the stamps")
+        size = side - 2 * _RIM - 1 + (side % 2)
+    if size % 2 == 0 or not _LEAST_SIZE <= size <= side:
+        limits = f"{_LEAST_SIZE} to {side}, the side of the stamps"
+        raise DomainError(f"size = {size}: expected an odd number of pixels from {limits}")
 
     def less_sky(bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         level, rms = sky_of_stamps(raw_images, bad, _SKY * side)

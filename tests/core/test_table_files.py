@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from astropy import units as u
-from astropy.table import QTable
+from astropy.table import Column, MaskedColumn, QTable, Table
 
 from pachon.core.errors import ConfigError
-from pachon.core.table_files import in_format_of, parquet_bytes, read_columns, write_table
+from pachon.core.table_files import column_in_unit, in_format_of, parquet_bytes, read_columns, write_table
 
 pyarrow = pytest.importorskip("pyarrow")
 
@@ -41,6 +41,33 @@ def test_units_are_read_again(tmp_path, ending):
     assert (columns["z4"].unit, columns["slope"].unit) == (u.nm, u.electron / u.pix**2)
     assert columns["z4"].tolist() == [1.5, 2.5]
     assert {"n", "w"} <= set(columns)
+
+
+@pytest.mark.parametrize("writer", ["astropy", "fields"])
+def test_units_that_parquet_states_are_those_of_its_columns(tmp_path, writer):
+    """A right ascension of 0.9 rad was read as 0.9 deg."""
+    path = tmp_path / "t.parquet"
+    if writer == "astropy":
+        QTable({"RA": [0.9, 1.0] * u.rad, "d": Column([1.0, 2.0], unit="mm"), "n": ["a", "b"]}).write(path)
+    else:
+        columns = {"RA": (np.array([0.9, 1.0]), "rad", ""), "d": (np.ones(2), "mm", ""), "n": (np.zeros(2), "", "none")}
+        path.write_bytes(parquet_bytes(path, columns, error=ConfigError))
+    columns = read_columns(path)
+    assert column_in_unit(columns, "ra", u.deg).tolist() == [0.9, 1.0]
+    assert columns["d"].unit == u.mm
+    assert getattr(columns["n"], "unit", None) is None
+
+
+def test_masked_rows_of_parquet_are_no_numbers(tmp_path):
+    """astropy writes what a masked row holds, a magnitude of -99 for example, and the mask beside it."""
+    path = tmp_path / "t.parquet"
+    masked = MaskedColumn([20.0, -99.0], mask=[False, True], unit="mag")
+    Table({"mag": masked, "n": MaskedColumn([1, 2], mask=[True, False]), "x [mm]": masked}).write(path)
+    columns = read_columns(path)
+    assert list(columns) == ["mag", "n", "x [mm]", "x"]
+    np.testing.assert_array_equal(column_in_unit(columns, "x", u.m), [0.02, np.nan])
+    np.testing.assert_array_equal(column_in_unit(columns, "mag", None), [20.0, np.nan])
+    np.testing.assert_array_equal(column_in_unit(columns, "n", None), [np.nan, 2.0])
 
 
 def test_names_that_units_would_change_are_kept(tmp_path):

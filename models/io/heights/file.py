@@ -71,13 +71,15 @@ def read_heights(path: str | Path, camera: Camera) -> MeasuredHeights:
             else:
                 heights, covered = _fitted(_table_points(content, path), camera)
         else:
-            images = {name: xyz for name, xyz in content.items() if name in camera.ccd_names}
+            # Names of FITS extensions are the same in capitals, in which astropy writes them.
+            ccd_names = {name.upper(): name for name in camera.ccd_names}
+            images = {ccd_names[name.upper()]: xyz for name, xyz in content.items() if name.upper() in ccd_names}
             if not images:
                 first = ", ".join(list(content)[:3])
                 raise PrescriptionError(f"images {first}: expected names such as {camera.ccd_names[0]}", file=path)
-            _warn_of_others(path, [name for name in content if name not in images])
-            heights, covered = _fitted(np.concatenate(list(images.values()), axis=1), camera)
+            _warn_of_others(path, [name for name in content if name.upper() not in ccd_names])
             _check_places(images, camera)
+            heights, covered = _fitted(np.concatenate(list(images.values()), axis=1), camera)
     _warn(path, camera, heights, covered)
     return heights
 

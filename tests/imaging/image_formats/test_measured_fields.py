@@ -13,8 +13,9 @@ from scipy import ndimage
 
 import pachon
 from pachon.commands.cli import main
-from pachon.core.errors import ConfigError, DomainError, PachonError
+from pachon.core.errors import ConfigError, DomainError, PachonError, ProductError
 from pachon.imaging.image_psf import psfs_on
+from pachon.imaging.star_positions import table_in
 from pachon.measure.catalogue.matching import match_positions
 
 DATA = Path(__file__).parents[2] / "data"
@@ -193,6 +194,13 @@ def test_catalogues_of_stars_by_pixels_and_by_the_sky(image, field, tmp_path, ca
         table.write(tmp_path / "bad.csv", overwrite=True)
         assert main(["measure", str(tmp_path / "a.fits"), "--stars", str(tmp_path / "bad.csv"), "--quiet"]) == 2
         assert text in capsys.readouterr().err
+
+
+def test_a_table_of_stars_in_another_format_names_those_that_are_read(tmp_path):
+    path = tmp_path / "stars.parquet"
+    path.write_bytes(b"PAR1\x15\x80")
+    with pytest.raises(ProductError, match="no table of stars in FITS, ECSV or CSV"):
+        table_in(path)
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Measured heights from files: tables of points and of Zernike coefficients, FITS images, and errors in them."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -156,17 +157,36 @@ def test_images_keep_steps_and_bowls(tmp_path, frame):
     assert plane.residual.max() < 1e-12
 
 
-def test_images_with_turned_pixels(tmp_path):
+@pytest.mark.parametrize("matrix", ["CD", "PC", "PC and CDELT"])
+def test_images_with_turned_pixels(tmp_path, matrix):
     made = images()
     for hdu in made[1:]:
         step = hdu.header["CDELT1"]
-        for key in ("CDELT1", "CDELT2"):
-            del hdu.header[key]
-        # Columns along -y, rows along x.
-        hdu.header.update({"CD1_2": step, "CD2_1": -step})
-        hdu.data = hdu.data.T[:, ::-1].copy()
+        if matrix == "PC and CDELT":
+            hdu.header.update({"PC1_1": 0.0, "PC1_2": 1.0, "PC2_1": -1.0, "PC2_2": 0.0})
+        else:
+            for key in ("CDELT1", "CDELT2"):
+                del hdu.header[key]
+            # Columns along -y, rows along x.
+            hdu.header.update({f"{matrix}1_2": step, f"{matrix}2_1": -step})
+            if matrix == "PC":
+                hdu.header.update({"PC1_1": 0.0, "PC2_2": 0.0})
+        # Higher towards +x, so that the bowl is none in any direction.
+        slope = 1e-4 * step * (np.arange(hdu.data.shape[1]) - 0.5 * (hdu.data.shape[1] - 1))
+        hdu.data = (hdu.data + 1e3 * slope).T[:, ::-1].copy()
     made.writeto(tmp_path / "heights.fits")
-    check(FocalPlane.from_file(tmp_path / "heights.fits", SMALL), 2e-12)
+    plane = FocalPlane.from_file(tmp_path / "heights.fits", SMALL)
+    dx, dy = np.random.default_rng(1).uniform(-0.97 * HALF, 0.97 * HALF, (2, 300))
+    for i in (0, 1):
+        expected = bowl(i, dx, dy) + 1e-4 * dx
+        assert np.allclose(plane.height(*(CENTERS[i, :, None] + [dx, dy])), expected, rtol=0, atol=2e-12)
+
+
+def test_names_of_extensions_are_those_of_ccds_in_any_case(tmp_path):
+    """astropy writes EXTNAME in capitals, and CCDs of HSC have small letters."""
+    images().writeto(tmp_path / "heights.fits")
+    camera = replace(SMALL, ccd_names=tuple(name.lower() for name in NAMES))
+    check(FocalPlane.from_file(tmp_path / "heights.fits", camera), 2e-12)
 
 
 def test_large_images_are_averaged(tmp_path):
@@ -269,6 +289,8 @@ def test_bad_tables_are_refused_in_one_line(tmp_path, table, parts):
         ({"EXTNAME": "A_S00"}, ["image 2: EXTNAME = 'A_S00': expected the name of a CCD, once"]),
         ({"EXTNAME": None}, ["image 1: EXTNAME = ''"]),
         ({"CRVAL1": 21.0}, ["image A_S00: has pixels on A_S01"]),
+        ({"CRVAL1": -19.8}, ["image A_S01: has pixels on A_S00"]),
+        ({"CROTA2": 30.0}, ["A_S00", "CROTA1, CROTA2: expected a rotation as CDi_j, or CDELTi and PCi_j"]),
     ],
 )
 def test_bad_images_are_refused_in_one_line(tmp_path, cards, parts):

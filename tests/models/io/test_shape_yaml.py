@@ -130,6 +130,8 @@ def test_bad_grid_files_are_refused_in_one_line(tmp_path):
         (written("unit.fits", np.zeros((5, 5)), BUNIT="Jy"), "BUNIT = 'Jy': expected a unit of length"),
         (written("step.fits", np.zeros((5, 5)), CDELT2=-1.0), "expected ascending nodes"),
         (bare, "CRPIX1 is missing"),
+        (written("turned.fits", np.zeros((5, 5)), PC1_2=0.5), "PC1_2 = 0.5: expected 0, nodes along x and y"),
+        (written("rotated.fits", np.zeros((5, 5)), CROTA2=30.0), "CROTA2 = 30.0: expected 0"),
     ]
     for path, message in cases:
         with pytest.raises(PrescriptionError, match=message) as caught:

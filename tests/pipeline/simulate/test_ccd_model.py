@@ -9,6 +9,7 @@ from pachon.core.errors import DomainError
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
 from pachon.pipeline.simulate.ccd_model import CcdFit, fit_ccds, model_ccd, model_ccds
+from pachon.reconstruction.psf_model.model import PsfModel
 
 NAMES = ("R22_S11", "R41_S21", "R24_S12")
 
@@ -47,3 +48,18 @@ def test_ccds_modelled_together_have_the_bytes_of_each_alone(tiny):
         assert len(fit.observed.sigma) == product.observed.used.sum()
         for moments, expected in ((fit.holdout, of_product.holdout), (fit.observed, of_product.observed)):
             np.testing.assert_array_equal(moments, expected)
+
+
+@pytest.mark.long
+def test_a_ccd_whose_psfs_or_model_have_no_shape_cannot_be_modelled(tiny, monkeypatch):
+    """The correlations of the whole run failed, after all was computed."""
+    blurred = tiny(psf__engine="long_exposure", atmosphere__r0_m=0.02, atmosphere__zenith_angle_deg=75.0)
+    experiment = Experiment.from_config(blurred)
+    name = experiment.config.ccds[0]
+    with pytest.raises(DomainError, match=r"no noise-free PSF has a shape on \d+ x \d+ pixels \(psf.stamp\)"):
+        model_ccd(experiment, expose_ccd(experiment, name, threads=1))
+    experiment = Experiment.from_config(tiny(psf__engine="long_exposure"))
+    exposure = expose_ccd(experiment, name, threads=1)
+    monkeypatch.setattr(PsfModel, "at", lambda _, places, **__: np.full((len(places), 31, 31), -1.0))
+    with pytest.raises(DomainError, match="the PSF model has no shape, faint stars are lost in the noise of"):
+        model_ccd(experiment, exposure)

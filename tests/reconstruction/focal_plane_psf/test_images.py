@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from pachon.measure.shapes import measure_shapes
-from pachon.reconstruction.focal_plane_psf.images import ResidualImages, with_shapes
+from pachon.reconstruction.focal_plane_psf.images import ResidualImages, has_shape, with_shapes
 from pachon.reconstruction.focal_plane_psf.mosaic import Mosaic
 
 ARCSEC = np.pi / 648000
@@ -41,6 +41,13 @@ def test_images_have_the_shapes_asked_for(factor):
     np.testing.assert_allclose(found.sum(axis=(1, 2)), 1.0, rtol=1e-13)
     # Centred: the second star stood half a pixel off.
     np.testing.assert_allclose(centre, 0.0, atol=1e-4)
+
+
+def test_shapes_that_no_image_has_are_told():
+    """Noise gives faint stars shapes for which a convolution, of negative width, ends in rings or in no image."""
+    asked = np.concatenate([values(BASE)[0] + CHANGE, values(BASE[:1])[0] + [[-0.2, 0.0, -0.4]]])
+    drawn = with_shapes(BASE[[0, 1, 2, 0]], asked, PIXEL, WEIGHT)
+    assert has_shape(drawn).tolist() == [True, True, True, False]
 
 
 def test_images_of_their_own_shapes_stay_as_they_are():

@@ -9,6 +9,7 @@ from astropy import units as u
 from threadpoolctl import threadpool_limits
 
 from pachon.core.errors import ConfigError, DomainError, PachonError, ProductError, UnknownNameError
+from pachon.core.progress import Reporter
 from pachon.measure.shapes import measure_shapes
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.silicon import Silicon
@@ -321,6 +322,21 @@ def test_drawn_images_have_the_predicted_shapes(aligned):
     # The centre of an image is the least certain, and by far less than itself.
     assert (spread.max(axis=(1, 2)) < 0.1 * images.max(axis=(1, 2))).all()
     assert (spread.max(axis=(1, 2)) > 0.0).all()
+
+
+@pytest.mark.long
+def test_stars_of_shapes_that_no_image_has_are_left_out_of_the_components(aligned, exposure, few):
+    """Their singular values did not converge, or rings were the components."""
+    given = exposure.stars(few)
+    images = aligned.draw(given.ccd, given.x, given.y)
+    stamps = images * (1.0 + 0.1 * np.sin(np.arange(len(images)))[:, None, None] * np.linspace(-1.0, 1.0, 31))
+    given = replace(given, stamps=stamps, pixel_scale=aligned.field.optics.pixel_scale)
+    shapes = aligned.field.data.values.copy()
+    shapes[[3, 7]] += [-0.2, 0.0, -0.4]
+    data = replace(aligned.field.data, values=shapes)
+    model = replace(aligned, field=replace(aligned.field, data=data))._with_stamps(given, 2, None, Reporter(quiet=True))
+    assert len(model.pca.coefficients) == len(images) - 2
+    assert np.isfinite(model.pca.components).all()
 
 
 @pytest.mark.long

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from matplotlib.figure import Figure
 
 from pachon import PsfModel
 from pachon.commands.cli import main
@@ -16,6 +17,7 @@ from pachon.measure.shapes import measure_shapes
 from pachon.measure.star_selection import StarFlag
 from pachon.reconstruction.own_stars.own_stars import fit_own_stars
 from pachon.reconstruction.own_stars.star_catalogue import StarCutouts, load_stars
+from pachon.reconstruction.stamp_gallery import StampGallery
 
 PIXEL = np.deg2rad(0.2 / 3600.0)
 SIZE, SKY, COUNT = 33, 22.0, 60
@@ -105,6 +107,17 @@ def test_clipped_stars_are_left_out_without_a_level_of_saturation(stars, own):
     unclipped = fit_own_stars(np.minimum(stars.stamps, level), stars.positions, PIXEL, saturation=10.0 * level)
     assert ((unclipped.flags & StarFlag.SATURATED) > 0).sum() < clipped.sum()
     assert not clipped_stars(np.ones((5, 9, 9)), np.zeros((5, 9, 9), dtype=bool)).any()
+
+
+def test_stars_of_which_most_are_clipped_at_one_level_are_not_without_noise(stars):
+    peaks = stars.stamps.max(axis=(1, 2))
+    level = np.quantile(peaks, 0.3)
+    clipped = clipped_stars(np.minimum(stars.stamps, level), np.zeros(stars.stamps.shape, dtype=bool))
+    assert clipped.tolist() == (peaks >= level).tolist()
+    # Symmetric stars without noise have four equal pixels each.
+    squares = np.add.outer(*2 * [(np.arange(8) - 3.5) ** 2])
+    symmetric = np.exp(-0.2 * squares) * np.ones((9, 1, 1))
+    assert not clipped_stars(symmetric, np.zeros(symmetric.shape, dtype=bool)).any()
 
 
 def test_residuals_of_held_out_stars_are_their_noise(own):
@@ -219,7 +232,9 @@ def test_stars_that_sextractor_flags_are_left_out(stars, tmp_path, monkeypatch, 
     [
         ({"size": 30}, "size = 30: expected an odd number of pixels from 9 to 33"),
         ({"size": 35}, "size = 35: expected an odd number"),
-        ({"gain": 0.0}, "gain = 0.0: expected a number of electrons above 0"),
+        ({"gain": 0.0}, r"gain = 0\.0: expected a positive, finite number of electrons"),
+        ({"gain": 1e308}, r"gain = 1e\+308: expected a positive, finite number of electrons"),
+        ({"min_snr": np.nan}, "min_snr = nan: expected the least S/N of a star"),
         ({"min_snr": 1e6}, "0 of 60 stars left"),
         ({"pixel_scale": -1.0}, "pixel_scale"),
         ({"extent": "wide"}, r"^extent = 'wide': expected real numbers"),
@@ -228,6 +243,16 @@ def test_stars_that_sextractor_flags_are_left_out(stars, tmp_path, monkeypatch, 
 def test_bad_values_are_named(stars, change, message):
     with pytest.raises(DomainError, match=message):
         fit_own_stars(*stars, **({"pixel_scale": PIXEL} | change))
+    with pytest.raises(DomainError, match="stamps of 7 pixels along a side: expected at least 13, or size"):
+        fit_own_stars(stars.stamps[:, :7, :7], stars.positions, PIXEL)
+
+
+@pytest.mark.parametrize(("pixel", "bar"), [(1e-4, "0.001 arcsec"), (0.2, "2 arcsec"), (50.0, "500 arcsec")])
+def test_the_bar_under_stamps_fits_pixels_of_any_size(pixel, bar):
+    """No bar was short enough for pixels of less than 0.0005 arcsec."""
+    axes = Figure().add_subplot()
+    StampGallery(axes, 31, np.deg2rad(pixel / 3600.0)).finish(1, 1)
+    assert [text.get_text() for text in axes.texts] == [bar]
 
 
 def test_options_of_the_model_are_checked(stars):

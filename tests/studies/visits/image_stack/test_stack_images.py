@@ -198,6 +198,8 @@ def test_refusals(visits_folder, tmp_path_factory, monkeypatch, capsys):
     err = capsys.readouterr().err
     assert err.count("\n") == 1
     assert "no visits" in err
+    assert main(["stack-images", str(visits_folder), "--faintest", "nan"]) == 2
+    assert capsys.readouterr().err == "pachon: error: command line: faintest = NaN: expected a number from 15\n"
     with pytest.raises(ProductError, match="no images"):
         ImageStack.of(visits_folder)
     monkeypatch.setattr(module.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 1000}))
