@@ -26,7 +26,7 @@ class DonutFlag(IntFlag):
     ``DEFOCUS_SIGN``: the image fits the other side of focus better. ``OUTSIDE_FIELD``: the telescope does not cover the
     field. ``NO_LIGHT``: no light passes the telescope there, or the chief ray does not reach a CCD.
     ``TOO_FEW_PHOTONS``: the donut stands out from the noise by less than 9 times the root of the number of Zernikes.
-    ``UNDETERMINED``: errors of a donut's exceed 1 um rms, as where most of the pupil is dark.
+    ``UNDETERMINED``: those of a donut have errors above 1 um rms, as where most of the pupil is dark.
     ``NOT_CONVERGED``: the fit did not converge. ``INTERRUPTED``: Ctrl-C came before the fit.
     """
 
