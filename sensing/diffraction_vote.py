@@ -29,7 +29,7 @@ from .light import Instrument, diffracting_pieces
 from .likelihood import linearized, pixel_variance
 from .sides import CONTRADICTED
 from .stamps import central_slices
-from .star_fitter import SMALLEST_DONUT, StarSolution
+from .star_fitter import StarSolution
 
 #: Donuts that are asked.
 _VOTERS = 3
@@ -63,7 +63,7 @@ def _rim_amplitude(instrument: Instrument, star: StarSolution) -> _RimAmplitude 
     stamp, solution, light = star.stamp, star.solution, star.light
     unknowns, wave = solution.stars[0], solution.waves[0]
     blur = float(instrument.seeing.fwhm(unknowns[STRENGTH])) * light.scale
-    if not _has_air(star) or light.diameter < max(SMALLEST_DONUT * instrument.pixel, FEW_WIDTHS * blur):
+    if not _has_air(star) or not instrument.is_donut(light) or light.diameter < FEW_WIDTHS * blur:
         return None
     pieces = diffracting_pieces(light.diameter / stamp.grid.pixel)
     rims = pupil_rims(light.telescope, light.direction, instrument.middle, pieces)

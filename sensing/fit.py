@@ -49,7 +49,7 @@ from .rim_table import moved_rims, rim_table
 from .shared_rims import contradicted
 from .stamps import Pixels, central_slices
 from .star_errors import ErrorParts
-from .star_fitter import SMALLEST_DONUT, StarSolution
+from .star_fitter import StarSolution
 from .step_search import fit_steps
 from .wavefront_fits import NOLL, FittedStars, SingleDonuts, UsableStars, WavefrontFit
 
@@ -300,7 +300,7 @@ def _fit_alone(
     masked = star.masked | not_finite
     saturated = saturated_pixels(np.where(masked, 0.0, star.image), masked, instrument.model.detector.saturation)
     masked = masked | grown(saturated, ~masked)
-    donut = light.diameter > SMALLEST_DONUT * instrument.pixel
+    donut = instrument.is_donut(light)
     wavefront = not joint or donut
     fitted_once = partial(
         _fit_with_noise,

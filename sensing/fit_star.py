@@ -22,7 +22,7 @@ from .rim_search import MOST_BODIES, RimFit, RimSolver, settled, with_another_ri
 from .sides import CONTRADICTED, BothSides, SideFit
 from .solve import COARSE, Solution
 from .stamps import Pixels, plane_basis
-from .star_fitter import BRIGHT, SMALLEST_DONUT, StarFitter, StarSolution, Start
+from .star_fitter import BRIGHT, StarFitter, StarSolution, Start
 from .undetermined import is_faint, is_hopeless
 
 #: Signal over noise of a donut above a plane background of any level; the noise of a sky reaches 4 somewhere on a
@@ -134,8 +134,7 @@ def fit_star(
     preliminary : bool
         Whether rims elsewhere are left to a fit that begins from this one, unless coarse pixels tell them.
     """
-    across = light.diameter / instrument.pixel
-    donut = across > SMALLEST_DONUT
+    donut = instrument.is_donut(light)
     fitter = StarFitter(instrument, light, without_bad_pixels(pixels) if donut else pixels, strength, wavefront)
     if begun is not None and begun.usable is not None and _holds(begun, light):
         return _continued(fitter, pixels, begun, begun.usable, electron)

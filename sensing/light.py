@@ -30,6 +30,8 @@ from .stamps import Pixels
 from .terms import WavefrontTerms
 from .vignetting import MovableRim, cells_with_rims, movable_rims, shift_spread
 
+#: Images wider than this are donuts [pixels].
+_SMALLEST_DONUT = 24.0
 #: Points across the pupil for the size of an image.
 _SURVEY = 48
 #: The same for the distance to its focus.
@@ -131,6 +133,10 @@ class Instrument:
     def noll(self) -> np.ndarray:
         """Noll indices of all terms of the wavefront."""
         return self.terms.every
+
+    def is_donut(self, light: StarLight) -> bool:
+        """Return whether the image of a star is large enough for a donut."""
+        return light.diameter > _SMALLEST_DONUT * self.pixel
 
     @property
     def known_seeing(self) -> bool:

@@ -22,8 +22,6 @@ from .rim_search import RimFit, RimSolver, finished
 from .solve import FINE, STEPS, Group, Solution, solve
 from .stamps import Match, Pixels, match_template, measured_variance
 
-#: Images wider than this are donuts [pixels].
-SMALLEST_DONUT = 24.0
 #: Pixels across a donut in the coarse fit, about.
 _COARSE_DIAMETER = 30.0
 #: Diameters of a donut from its middle, and pixels beyond, within which a stamp is fitted: farther away, stars
@@ -142,7 +140,7 @@ class StarFitter:
         self, instrument: Instrument, light: StarLight, clean: Pixels, strength: float, wavefront: bool
     ) -> None:
         self.instrument, self.clean, self._wavefront = instrument, clean, wavefront
-        self.donut = light.diameter > SMALLEST_DONUT * instrument.pixel
+        self.donut = instrument.is_donut(light)
         self._strength = strength
         self._strength_prior = instrument.strength_prior
         self._fwhm = float(instrument.seeing.fwhm(np.asarray(strength)))

@@ -41,7 +41,7 @@ from .shared_rims import (
 from .sided_stars import sided_stars
 from .solve import DAMPING, Solution, solve
 from .star_errors import ErrorParts, model_floor, star_errors, with_errors
-from .star_fitter import SMALLEST_DONUT, StarSolution
+from .star_fitter import StarSolution
 from .terms import WavefrontTerms
 from .undetermined import is_undetermined
 
@@ -163,8 +163,7 @@ class WavefrontFit(ABC):
         if star.usable is None or not len(star.usable.solution.shared):
             return star
         best = with_errors(instrument, star.usable)
-        donut = best.light.diameter > SMALLEST_DONUT * instrument.pixel
-        if donut and is_undetermined(star_errors(instrument, best).parts.total):
+        if instrument.is_donut(best.light) and is_undetermined(star_errors(instrument, best).parts.total):
             return StarFit(DonutFlag.UNDETERMINED)
         return replace(star, best=best)
 

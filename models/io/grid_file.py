@@ -100,8 +100,8 @@ def _axis(header: Any, number: int, size: int) -> np.ndarray:
             raise PrescriptionError(f"{key} is missing: expected the header to say where the nodes are")
         if isinstance(header[key], bool) or not isinstance(header[key], (int, float)) or not np.isfinite(header[key]):
             raise PrescriptionError(f"{key} = {header[key]!r}: expected a number")
-    other = 3 - number
-    unturned = {f"PC{number}_{number}": 1, f"PC{number}_{other}": 0, f"CD{number}_{other}": 0, f"CROTA{number}": 0}
+    cross = 3 - number
+    unturned = {f"PC{number}_{number}": 1, f"PC{number}_{cross}": 0, f"CD{number}_{cross}": 0, f"CROTA{number}": 0}
     for key, expected in unturned.items():
         if header.get(key, expected) != expected:
             raise PrescriptionError(f"{key} = {header[key]!r}: expected {expected}, nodes along x and y")

@@ -188,7 +188,7 @@ class LayerFit:
 
     def evaluations(self, forecast: bool) -> int:
         """Return about how many likelihoods :meth:`search` computes."""
-        return _ITERATIONS + len(_NUGGETS) + (1 if forecast else _DIRECTIONS)
+        return _ITERATIONS + (1 if forecast else _DIRECTIONS)
 
     def search(self, forecast: bool = False, advance: Callable[[int], None] | None = None) -> LayerCovariance:
         """Find the winds, from the most likely of some random directions, or from those of the prior."""
@@ -200,10 +200,16 @@ class LayerFit:
         # Without it strengths would make up for it. By each wind it would take ten times as long as the likelihood.
         first = [self._wavefront_part(start) for start in starts[:_FIRST_DIRECTIONS]]
         self._by_wavefront = np.mean(first, axis=0)
+        table = self._table(starts[0])
         # No small nugget grows: the likelihood hardly changes with its logarithm.
-        nuggets = [np.r_[starts[0][:-3], np.full(3, math.log(nugget))] for nugget in _NUGGETS]
-        nugget = self._likeliest(nuggets, advance)[-3:]
-        best = self._likeliest([np.r_[start[:-3], nugget] for start in starts], advance)
+        nugget = max(_NUGGETS, key=lambda n: self._likelihood(table, n * self._variance, gradient=False)[0])
+        values = []
+        for start in starts:
+            start[-3:] = math.log(nugget)
+            values.append(self._likelihood(self._table(start), self._nugget(start), gradient=False)[0])
+            if advance is not None:
+                advance(1)
+        best = starts[int(np.argmax(values))]
         self._by_wavefront = self._wavefront_part(best)
         return self._climb(best, _ITERATIONS, advance)
 
@@ -218,15 +224,6 @@ class LayerFit:
         start[3 * n + 2 :] = np.log(covariance.nugget / self._variance)
         self._by_wavefront = self._wavefront_part(start)
         return self._climb(start, _AGAIN, advance)
-
-    def _likeliest(self, choice: list[np.ndarray], advance: Callable[[int], None] | None) -> np.ndarray:
-        """Return the parameters of the largest likelihood of some."""
-        values = []
-        for parameters in choice:
-            values.append(self._likelihood(self._table(parameters), self._nugget(parameters), gradient=False)[0])
-            if advance is not None:
-                advance(1)
-        return choice[int(np.argmax(values))]
 
     def _climb(self, start: np.ndarray, steps: int, advance: Callable[[int], None] | None) -> LayerCovariance:
         from scipy.optimize import minimize  # a fifth of a second

@@ -125,12 +125,11 @@ def draw_visit(
     reporter = reporter or Reporter(quiet=True)
     reporter.line(f"{visit.label}, {visit}")
     # Noise depends on the part of a CCD that is drawn: it is that of all tiles, whichever are due.
-    touched = {
-        name: window_on(stack.tiles, stack.frame, ccd_wcs)
+    windows = {
+        name: window
         for name, ccd_wcs in wcs.items()
-        if window_on(tiles, stack.frame, ccd_wcs) is not None
+        if window_on(tiles, stack.frame, ccd_wcs) and (window := window_on(stack.tiles, stack.frame, ccd_wcs))
     }
-    windows = {name: window for name, window in touched.items() if window is not None}
     exposure, sums = stack.exposure(), {tile: TileSums.empty(tile.side) for tile in tiles}
     bar = reporter.stage(f"images of {counted(len(windows), 'CCD')}", total=len(windows))
     with experiment.screens(threads, reporter), bar as stage:
