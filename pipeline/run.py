@@ -87,7 +87,8 @@ def run(
         left out.
     part : (i, n)
         Compute the i-th of n parts of the CCDs, of 1 to n; parts run side by side, on several machines, in one folder.
-        Finished CCDs are kept, as on resuming, and the part that ends last writes the report.
+        Finished CCDs are kept, as on resuming, and the part that ends last writes the report. Parts beyond the number
+        of CCDs have nothing to compute.
     execution : Execution, optional
         Workers that compute the CCDs, threads, whether to keep finished CCDs and add to them, and progress display.
 
@@ -102,9 +103,8 @@ def run(
     experiment = config if isinstance(config, Experiment) else Experiment.from_config(config)
     names = experiment.config.ccds or ()
     number, parts = part
-    if not 1 <= number <= parts <= len(names):
-        most = counted(len(names), "CCD")
-        raise DomainError(f"part = {number}/{parts}: expected i/n with i from 1 to n, and n at most {most}")
+    if not 1 <= number <= parts:
+        raise DomainError(f"part = {number}/{parts}: expected i/n with i from 1 to n")
     # Before the screens, which take longer than all of the checks.
     check_catalogue(experiment, names, strict=strict)
     if parts > 1:

@@ -129,6 +129,10 @@ def load_telescope(
     if configuration is not None and Path(text).suffix.lower() not in _CONFIGURED:
         problem = f"configuration = {configuration}: expected a file that ends in {' or '.join(_CONFIGURED)}"
         raise PrescriptionError(problem, subject=text)
+    glass_catalogues = tuple(glass_catalogues)
+    if glass_catalogues and (text in BUNDLED or Path(text).suffix.lower() in (".yaml", ".yml")):
+        problem = f"glass_catalogues: expected a lens file ({', '.join(_READERS)}); this one has its indices in it"
+        raise PrescriptionError(problem, subject=text)
     if text in BUNDLED:
         return _bundled(text)
     path = Path(text)

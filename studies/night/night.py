@@ -81,7 +81,8 @@ def run_night(
     base : Path, optional
         Folder that relative paths in the configuration start from; the current one by default.
     part : (i, n)
-        Compute the i-th of n parts of the visits, of 1 to n; parts run side by side in one folder.
+        Compute the i-th of n parts of the visits, of 1 to n; parts run side by side in one folder. Parts beyond the
+        number of visits have nothing to compute.
     execution : Execution, optional
         Workers that compute the visits, threads, whether to go on after finished visits, and progress display.
 
@@ -100,8 +101,8 @@ def run_night(
         healpix_module()
     visits = config.read_list(base)
     number, parts = part
-    if not 1 <= number <= parts <= len(visits):
-        raise DomainError(f"part = {number}/{parts}: expected i/n with i from 1 to n, and n at most {len(visits)}")
+    if not 1 <= number <= parts:
+        raise DomainError(f"part = {number}/{parts}: expected i/n with i from 1 to n")
     if parts > 1:
         execution = replace(execution, resume=True)
     reporter = execution.reporter

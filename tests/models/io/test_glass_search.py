@@ -122,3 +122,12 @@ def test_wrong_configurations_are_named(tmp_path, monkeypatch, catalogue):
     monkeypatch.setenv("PACHON_GLASS_PATH", str(tmp_path / "none"))
     with pytest.warns(PrescriptionWarning, match=r"PACHON_GLASS_PATH: .*none: expected an AGF file, or a folder"):
         assert user_catalogues() == ()
+
+
+def test_a_catalogue_for_a_telescope_without_glasses_is_refused(tmp_path):
+    own = tmp_path / "mine.yaml"
+    pachon.save_telescope(pachon.load_telescope("paul_baker"), own)
+    for name in ("paul_baker", str(own)):
+        with pytest.raises(PrescriptionError, match=r"glass_catalogues: expected a lens file \(\.zmx, ") as error:
+            pachon.load_telescope(name, glass_catalogues=["nofile.agf"])
+        assert str(error.value).startswith(f"{name}: ")

@@ -157,6 +157,7 @@ def test_workers_parts_and_interruptions_leave_the_same_bytes(night, night_confi
     first = run_night(config, tmp_path / "parts", part=(1, 2))
     assert first.missing == (1002,)
     assert not first.summary["complete"]
+    run_night(config, tmp_path / "parts", part=(5, 5))  # more jobs than visits
     run_night(config, tmp_path / "parts", part=(2, 2))
     assert content(tmp_path / "parts") == files
 
@@ -237,8 +238,8 @@ def test_settings_that_do_not_fit(night_config, tmp_path):
     ):
         with pytest.raises(ConfigError, match=message):
             run_night(night_config(**sections), tmp_path)
-    with pytest.raises(DomainError, match="part = 4/4"):
-        run_night(night_config(), tmp_path, part=(4, 4))
+    with pytest.raises(DomainError, match="part = 5/4"):
+        run_night(night_config(), tmp_path, part=(5, 4))
 
 
 @pytest.mark.usefixtures("empty_pictures")
