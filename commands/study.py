@@ -137,7 +137,7 @@ def _verdict(result: Study) -> str:
     metrics = result.metrics[best_case]
     error = metrics["error_rms_g_away"]
     return (
-        f"Recommended for {base.stars} stars of S/N {base.snr:g} and more: {best_case}; residual of g at holdout "
+        f"Recommended for {base.stars} stars {base.noise_text}: {best_case}; residual of g at holdout "
         f"positions {metrics['rms_g_away']:.2e}" + (f" ± {error:.0e}." if math.isfinite(error) else ".")
     )
 

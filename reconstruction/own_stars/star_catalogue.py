@@ -203,7 +203,7 @@ def load_stars(
     if not finite.all():
         row = int(finite.argmin())
         at = ", ".join(f"{value:g}" for value in positions[row])
-        raise ProductError(f"{x}, {y} of row {row} are {at}: expected numbers", file=path)
+        raise ProductError(f"{x}, {y} of row {row + 1} are {at}: expected numbers", file=path)
     quality: dict[str, np.ndarray | None] = {}
     for kind, column in (("weight", weight), ("variance", None), ("mask", mask)):
         name = _find_column(kind if column is None else column, columns)

@@ -41,6 +41,11 @@ class Case:
         """Number of terms of a polynomial."""
         return term_count(self.order)
 
+    @property
+    def noise_text(self) -> str:
+        """Noise of the stars, in words."""
+        return "without noise" if self.snr == NOISE_FREE else f"of S/N {self.snr:g} and more"
+
     def normalised(self) -> Case:
         """Return the case as it is fitted: parameters without effect have one value."""
         if self.interpolation in FOCAL_PLANE:

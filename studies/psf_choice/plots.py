@@ -52,7 +52,7 @@ def stars_plot(result: Study) -> bytes:
         panels[0].plot([], [], color="0.4", linestyle=(0, (4, 2)), linewidth=0.9, label="noise alone, in theory")
         panels[0].plot([], [], color="0.4", linestyle=_QUIET, linewidth=0.9, label="stars without noise")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=8)
-        figure.suptitle(f"How many stars, which order (faintest star S/N {plan.base.snr:g})", x=0.01, ha="left")
+        figure.suptitle(f"How many stars, which order (stars {plan.base.noise_text})", x=0.01, ha="left")
         return png_bytes(figure)
 
 

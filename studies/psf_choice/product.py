@@ -46,7 +46,7 @@ def study_summary(result: Study) -> dict[str, Any]:
         **({"focal_plane": [_case_entry(result, case) for case in together]} if plan.focal_plane else {}),
         "best_order": orders,
         "fitted": len(result.metrics),
-        "not_fitted": {f"{case.stars} stars, S/N {case.snr:g}, {case}": why for case, why in result.problems.items()},
+        "not_fitted": {f"{case.stars} stars {case.noise_text}, {case}": why for case, why in result.problems.items()},
     }
 
 

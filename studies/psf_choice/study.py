@@ -128,7 +128,7 @@ def study(config: Configuration, plan: Plan, *, threads: int | None = None, repo
                         problems |= dict.fromkeys(together, str(error))
                     stage.advance(len(together))
                 done += len(snr_cases)
-                stage.step(f"S/N {snr:g}, noise {draw + 1}", done, total)
+                stage.step(f"stars {snr_cases[0].noise_text}, noise {draw + 1}", done, total)
     fitted_cases = [case for case in cases if case not in problems]
     if not fitted_cases:
         raise DomainError(f"no model could be fitted: {problems[cases[0]]}")

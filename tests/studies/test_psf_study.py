@@ -255,6 +255,11 @@ def small(tiny):
     return plan, study(tiny(), plan, threads=1)
 
 
+def test_noise_in_words():
+    assert Case(40).noise_text == "of S/N 30 and more"
+    assert Case(40, snr=NOISE_FREE).noise_text == "without noise"
+
+
 def test_cases_about_the_default_model_have_recipes():
     """As of the config.yaml of a run, which names pixels and kriging: components are those of other bases alone."""
     base = Case.of_recipe(40, 30.0, DEFAULT)

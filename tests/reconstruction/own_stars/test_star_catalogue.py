@@ -209,7 +209,7 @@ def test_a_place_that_is_no_number_is_named(tmp_path):
     stamps, positions = stars()
     positions[4, 1] = np.nan
     path = catalogue(tmp_path / "stars.fits", stamps, positions)
-    with pytest.raises(ProductError, match=r"stars\.fits: x, y of row 4 are [\d.]+, nan: expected numbers"):
+    with pytest.raises(ProductError, match=r"stars\.fits: x, y of row 5 are [\d.]+, nan: expected numbers"):
         load_stars(path)
 
 
