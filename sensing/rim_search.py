@@ -29,7 +29,7 @@ _FEWEST_SQUARES = 50
 #: is larger than given, a rim explains a tenth or two by chance.
 _MISFIT = 0.5
 #: Part of the misfit that a score test gives a rim that is tried: one that stands far off gains more in the end.
-_PROMISING = 0.2
+_PROMISING = 0.4
 #: Gain over the largest one from which on other rims are tried, too.
 _LIKELY = 0.4
 #: Loss by which fits with other rims are no worse: each of these may be the one that moved.
