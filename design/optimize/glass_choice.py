@@ -118,7 +118,8 @@ def choose_glasses(
 
     Index and Abbe number of each glass are variables first. Then, glass by glass, the nearest of the catalogue take its
     place, all variables are optimised again with each, and the best one stays. Near means a small change of the power
-    ``n - 1`` and of the dispersion ``1 / V``, both relative.
+    ``n - 1`` and of the dispersion ``1 / V``, both relative. The telescope's own glasses, if the catalogue has them,
+    stay where none of the others is better.
 
     Parameters
     ----------
@@ -190,6 +191,12 @@ def choose_glasses(
         history=np.concatenate([model.history, best.history[1:]]),
         operands=tuple(replace(b, start=m.start) for b, m in zip(best.operands, model.operands, strict=True)),
     )
+    if all(name in source for name in names):
+        # The glasses of the catalogue near the model's may all be worse than those that the telescope has.
+        kept = optimum(telescope, [])
+        trials += [GlassTrial(name, name, float(kept.history[-1])) for name in names]
+        if kept.history[-1] <= best.history[-1]:
+            final, glass_by_medium = kept, {name: name for name in names}
     return GlassChoice(final, model, glass_by_medium, tuple(trials))
 
 

@@ -8,6 +8,7 @@ import pytest
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError, UnknownNameError
+from pachon.design.optimize import glass_choice
 from pachon.design.optimize.merit import Beams, SpotMerit
 from pachon.design.optimize.optimize import optimize
 from pachon.models.io.glass_catalogue import GlassCatalogue
@@ -270,7 +271,8 @@ def test_glasses_of_a_catalogue(lens):
     )
     plain = optimize(start, ACHROMAT, "spots", **how)
     found = pachon.design.choose_glasses(start, ACHROMAT, ["N-BAK4"], nearest=3, **how)
-    assert len(found.trials) == 3
+    assert [t.name for t in found.trials][3:] == ["N-BAK4"]
+    assert found.trials[3].rms == pytest.approx(plain.merits[1], rel=1e-3)
     assert found.optimum.telescope.surface("S2").medium_after.name == found.glasses["N-BAK4"]
     assert found.glasses["N-BAK4"] in GlassCatalogue.bundled()
     assert found.optimum.merits[1] == pytest.approx(min(t.rms for t in found.trials), rel=1e-3)
@@ -281,6 +283,18 @@ def test_glasses_of_a_catalogue(lens):
     assert found.summary()["glasses"] == found.glasses
     with pytest.raises(UnknownNameError, match=r"N-FK5.*N-BAK4"):
         pachon.design.choose_glasses(start, ACHROMAT, ["N-FK5"], **how)
+
+
+def test_glasses_stay_where_no_other_is_better(doublet, monkeypatch):
+    """Of two crowns no achromat can be made."""
+    how = {"fields": [[0.0, 0.0]], "wavelengths": [D, F, C], "targets": [pachon.design.FocalLength(0.1)], "n_pupil": 3}
+    monkeypatch.setattr(glass_choice, "_nearest", lambda *_: ["N-BK7"])
+    found = pachon.design.choose_glasses(doublet, ACHROMAT, ["F2"], **how)
+    assert found.glasses == {"F2": "F2"}
+    assert found.optimum.telescope.surface("S2").medium_after == doublet.surface("S2").medium_after
+    assert found.optimum.merits[1] < found.optimum.merits[0]
+    assert [trial.name for trial in found.trials] == ["N-BK7", "F2"]
+    assert found.trials[1].rms < 0.1 * found.trials[0].rms
 
 
 @pytest.mark.parametrize(
