@@ -167,7 +167,7 @@ def vote_on_diffraction(
         by_waves: dict[int, StarFit] = {}
         for i, star in by_rays.items():
             if len(by_waves) < _VOTERS and abs(fall) < CONTRADICTED and (star.usable is None or _has_air(star.usable)):
-                by_waves[i] = alone(waves, i, replace(star.with_light(waves), searched=False))
+                by_waves[i] = alone(waves, i, star.with_light(waves))
                 fall += _chi2_fall(star, by_waves[i])
         diffraction = fall > 0.0
         if diffraction:

@@ -27,6 +27,8 @@ _COUNTED = 2
 _GRID = 480
 #: Widest part of the sky [deg] that is drawn in a plane; a wider one by Hammer's equal-area projection.
 _WIDEST_PLANE = 60.0
+#: Height of a panel of the whole sky over that of a part of it.
+_HEIGHT_OF_SKY = 0.55
 #: Least side of a part of the sky [deg] on which a CCD would be too small to be seen, and has a dot.
 _DOTTED = 10.0
 #: Area of a dot [pt^2].
@@ -42,14 +44,15 @@ _ONE_VALUE = 1e-6
 
 def maps_plot(maps: NightMaps) -> bytes:
     """Draw PSF width, depth and number of visits of each band; north is up, east at the left."""
-    bands = sorted(maps.bands)
+    bands = {band: maps.pictured(band) for band in sorted(maps.bands)}
+    grids = [_Grid(pictured[0]) for pictured in bands.values()]
+    heights = [_HEIGHT_OF_SKY if grid.whole_sky else 1.0 for grid in grids]
     with styled():
-        figure = new_figure(12.5, 3.9 * len(bands))
-        for row, band in enumerate(bands):
-            pictured = maps.pictured(band)
-            grid = _Grid(pictured[0])
+        figure = new_figure(12.5, 3.9 * sum(heights))
+        panels = figure.add_gridspec(len(bands), len(_TITLES), height_ratios=heights)
+        for row, (grid, (band, pictured)) in enumerate(zip(grids, bands.items(), strict=True)):
             for column, (content, title, colours) in enumerate(zip(pictured, _TITLES, _COLOURS, strict=True)):
-                axes = figure.add_subplot(len(bands), 3, 3 * row + column + 1, projection=grid.projection)
+                axes = figure.add_subplot(panels[row, column], projection=grid.projection)
                 valid = content[content.valid_pixels]
                 scale = Normalize(0.0 if column == _COUNTED else valid.min(), valid.max())
                 style: dict[str, Any] = {"cmap": colours, "norm": scale, "rasterized": True}
