@@ -113,6 +113,10 @@ def load_psfex(path: str | Path) -> PsfexPsf:
         raise ProductError(
             f"POLNAXIS = {groups:g}: expected 0, or 2 for the position in pixels", file=file, key="POLNAXIS"
         )
+    if groups and (together := _number(header, "POLNGRP", file, 1)) != 1:
+        raise ProductError(
+            f"POLNGRP = {together:g}: expected 1, x and y in one polynomial of a total degree", file=file, key="POLNGRP"
+        )
     zero, scale = np.zeros(2), np.ones(2)
     for axis in range(int(groups)):
         key = f"POLNAME{axis + 1}"

@@ -470,7 +470,7 @@ def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> D
         response_slope=slopes[0],
         response_slope_error=slopes[1],
         fwhm=width,
-        fwhm_error=width * errors[:, STRENGTH] / np.where(strength > 0.0, strength, 1.0),
+        fwhm_error=instrument.seeing.fwhm_error(strength, errors[:, STRENGTH]),
         chi2=chi2,
         n_pixels=n_pixels,
         sky_variance=noise,

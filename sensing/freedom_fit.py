@@ -81,11 +81,10 @@ class TelescopeFreedoms(WavefrontFit):
 
     def prepared(self, instrument: Instrument, star: StarFit) -> StarFit:
         """Return a star whose light depends on degrees of freedom in place of its own Zernikes."""
+        star = super().prepared(instrument, star)
         if star.best is None:
             return star
-        best = super().prepared(instrument, star).best
-        assert best is not None
-        return replace(star, best=self._with_cells(instrument, best, best.stamp.rays.cells))
+        return replace(star, best=self._with_cells(instrument, star.best, star.best.stamp.rays.cells))
 
     def solved(self, usable: UsableStars, pool: Executor) -> FittedStars:
         """Return the results of a joint fit with Gaussian priors."""

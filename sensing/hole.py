@@ -120,7 +120,7 @@ def _ratios(instrument: Instrument, star: StarSolution, fit: DonutFit, i: int) -
     inner, outer, level = _edges_of_quadrants(image, used)
     model = _edges_of_quadrants(telescope_image, np.ones(telescope_image.shape, dtype=bool))
     pixels = 2.0 * np.pi * np.maximum(inner, _LEAST_PIXELS) / _QUADRANTS
-    noise = np.sqrt((fit.sky_variance[i] + np.maximum(level, 0.0)) / pixels)
+    noise = np.sqrt((fit.sky_variance[i] + fit.photon_variance[i] * np.maximum(level, 0.0)) / pixels)
     clear = (model[1] - model[0] > max(_LEAST_WIDTH * fwhm, _LEAST_PIXELS)) & (level > _LEAST_SIGNAL * noise)
     if not clear.all():
         return [np.full(_QUADRANTS, np.nan)] * 2

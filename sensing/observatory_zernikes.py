@@ -203,11 +203,13 @@ def observatory_zernikes(
     waves = (DONUT_WAVELENGTH if wave is None else length(wave, "wave")) if convention == "donut" else np.nan
     scale = {"pachon": 1.0, "ts_wep": 1e6, "donut": 1.0 / waves}[convention]
     obscuration = 0.0 if convention == "donut" else fit.obscuration
-    values = fit.zernikes
-    if design is not None:
-        middle = float(fit.wavelengths[len(fit.wavelengths) // 2])
-        wavefront = wavefront_zernikes(design, fit.fields, middle, jmax=int(fit.noll.max()), projection=fit.projection)
-        values = values + wavefront.coefficients[:, fit.noll - 1]
+    values = fit.zernikes.copy()
+    # The design may not cover the fields of donuts without a result.
+    with_result = np.isfinite(values).all(axis=1)
+    if design is not None and with_result.any():
+        middle, fields = float(fit.wavelengths[len(fit.wavelengths) // 2]), fit.fields[with_result]
+        wavefront = wavefront_zernikes(design, fields, middle, jmax=int(fit.noll.max()), projection=fit.projection)
+        values[with_result] += wavefront.coefficients[:, fit.noll - 1]
     matrix = scale * zernike_matrix(fit.noll, frames.axes(frame)[:2, :2])
     matrix = matrix @ reexpansion(fit.noll, fit.obscuration, obscuration)
     return ObservatoryZernikes(

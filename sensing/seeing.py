@@ -35,6 +35,9 @@ _OTHERWISE = 5e-5
 # Strengths between which the FWHM is tabulated [1/m]: r0 of 0.5 m to 2 cm.
 _STRENGTHS = np.geomspace(2.0, 50.0, 15)
 _TABLE_POINTS = 4096
+# Step of the slope of the FWHM over the strength, wider than the steps of the table, and the least one [1/m].
+_SLOPE_STEP = 0.25
+_LEAST_STEP = 1e-3
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,12 @@ class Seeing:
         inside = np.clip(strength, _STRENGTHS[0], _STRENGTHS[-1])
         scale = np.interp(np.log(inside), np.log(_STRENGTHS), widths / _STRENGTHS)
         return np.asarray(strength * scale)
+
+    def fwhm_error(self, strength: np.ndarray, error: np.ndarray) -> np.ndarray:
+        """Return the standard deviations of :meth:`fwhm` [rad] by those of strengths [1/m]."""
+        step = np.maximum(_SLOPE_STEP * strength, _LEAST_STEP)
+        low, high = np.maximum(strength - step, 0.0), strength + step
+        return np.asarray(error * (self.fwhm(high) - self.fwhm(low)) / (high - low))
 
     @property
     def usual_strength(self) -> float:
@@ -113,5 +122,6 @@ def _structure_table(outer_scale: float, size: int) -> tuple[np.ndarray, np.ndar
 def _widths(wavelength: float, outer_scale: float) -> np.ndarray:
     """Return the full widths at half maximum [rad] of the tabulated strengths."""
     if math.isfinite(outer_scale):
-        return np.array([long_exposure_fwhm(wavelength, 1.0 / s, outer_scale) for s in _STRENGTHS])
+        # Of weak turbulence, as that of the infrared, without the core that only the pupil gives a width.
+        return np.array([long_exposure_fwhm(wavelength, 1.0 / s, outer_scale, halo=True) for s in _STRENGTHS])
     return np.asarray(_STRENGTHS * _KOLMOGOROV_FWHM * wavelength / fried_parameter(1.0, wavelength))

@@ -321,12 +321,16 @@ def _field_of(header: fits.Header, file: Path) -> tuple[float, float]:
 def sky_of_variance(variance: np.ndarray, masked: np.ndarray) -> float:
     """Return the variance of sky and readout of a stamp: the median of its variance plane along the edge.
 
-    The star's own photons, which a variance plane has in it too, are those of the model.
+    The star's own photons, which a variance plane has in it too, are those of the model. Where all of the edge is
+    masked, the median of the least quarter of the other pixels.
     """
     edge = np.zeros(variance.shape, dtype=bool)
     edge[:2], edge[-2:], edge[:, :2], edge[:, -2:] = True, True, True, True
-    usable = edge & ~masked & np.isfinite(variance)
-    return float(np.median(variance[usable])) if usable.any() else 0.0
+    usable = ~masked & np.isfinite(variance)
+    if (edge & usable).any():
+        return float(np.median(variance[edge & usable]))
+    values = np.sort(variance[usable])
+    return float(np.median(values[: -(-len(values) // 4)])) if len(values) else 0.0
 
 
 def _table(path: Path) -> Table:

@@ -83,10 +83,10 @@ def model_hdus(model: ModelFields) -> list[fits.ImageHDU | fits.BinTableHDU]:
             "raft_index": camera.raft_index.tolist(),
             "pixels": int(camera.pixels[0, 0]) if camera.alike else camera.pixels.tolist(),
             "pixel_size": camera.pixel_size,
+            "transposed": camera.transposed,
         }
         if not camera.alike:
             about["camera"]["rotation_deg"] = camera.rotation_deg.tolist()
-            about["camera"]["transposed"] = camera.transposed
     predicted = model.leave_one_out
     hdus = [
         _image_hdu("CENTERS", mosaic.centers),

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 #: Noise of e1, e2 and ln size times the S/N, of stars as wide as the weight, where no stamps are given.
 NOISE_PER_SNR = (0.50, 0.50, 0.52)
+# Pixels of the mean star that are changed at a time: of all at once, wide stamps would fill the memory.
+_PIXELS_TOGETHER = 1024
 
 
 class CcdStars(NamedTuple):
@@ -164,7 +166,9 @@ class FocalPlaneStars(Result):
         if "ccd" not in columns:
             raise DomainError(f"stars: no column 'ccd' among {', '.join(columns) or 'none'}")
         x, y = (_quantity(columns, name, u.m) for name in "xy")
-        in_pixels = getattr(columns["x"], "unit", None) == u.pix
+        in_pixels, y_in_pixels = (getattr(columns[name], "unit", None) == u.pix for name in "xy")
+        if in_pixels != y_in_pixels:
+            raise DomainError("stars: columns x and y: expected both in pixels, or both lengths")
         names = [v.decode().strip() if isinstance(v, bytes) else str(v).strip() for v in np.asarray(columns["ccd"])]
         images = np.asarray(columns["stamp"] if stamps is None and "stamp" in columns else stamps, dtype=np.float64)
         cube: np.ndarray | None = None
@@ -289,10 +293,18 @@ def _mean_star(
     weight = np.minimum(snr, 100.0) ** 2
     mean = np.einsum("n,nyx->yx", weight / weight.sum(), stamps.astype(np.float64))
     step = 1e-6
-    changed = mean + step * np.eye(mean.size).reshape(mean.size, *mean.shape)
-    shapes = measure_shapes(np.concatenate([mean[None], changed]), pixel_scale, weight_fwhm)
-    values = np.stack([shapes.e1, shapes.e2, np.log(shapes.size)])
-    return mean, (values[:, 1:] - values[:, :1]) / step
+
+    def values(images: np.ndarray) -> np.ndarray:
+        shapes = measure_shapes(images, pixel_scale, weight_fwhm)
+        return np.stack([shapes.e1, shapes.e2, np.log(shapes.size)])
+
+    slopes = np.empty((3, mean.size))
+    for first in range(0, mean.size, _PIXELS_TOGETHER):
+        pixels = np.arange(first, min(first + _PIXELS_TOGETHER, mean.size))
+        changed = np.repeat(mean.reshape(1, -1), len(pixels), axis=0)
+        changed[np.arange(len(pixels)), pixels] += step
+        slopes[:, pixels] = values(changed.reshape(-1, *mean.shape))
+    return mean, (slopes - values(mean[None])) / step
 
 
 def places_of(mosaic: Mosaic, stars: FocalPlaneStars) -> Places:

@@ -12,8 +12,9 @@ about the new heights, and about the wavefront that each exposure had at the las
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
 from ...core.result import Result
 from ...core.threads import one_blas_thread
+from ...core.units import ARCSEC
 from ...models.camera.camera import Camera
 from ...models.camera.cameras import load_camera
 from ...models.camera.ccd_surfaces import CcdSurfaces
@@ -40,7 +42,7 @@ from .heights import STATIC_DEGREE, HeightPrior
 from .mosaic import Mosaic
 from .optics_prior import OpticsPrior
 from .response import Instrument
-from .stars import places_of, stars_of
+from .stars import FocalPlaneStars, places_of, stars_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,6 +50,8 @@ if TYPE_CHECKING:
 
 #: Gauss-Newton steps about the heights of all exposures.
 STEPS = 3
+# Relative difference of weights that are the same.
+_SAME_WEIGHT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +159,8 @@ def fit_static_heights(
     exposures : sequence
         Stars of each, as :meth:`.FocalPlanePsf.fit` takes them; paths keep the memory at that of one exposure.
     telescope : Telescope or Instrument
-        The telescope; or an :class:`~pachon.Instrument`, which has wavelengths, atmosphere and detector too.
+        The telescope; or an :class:`~pachon.Instrument`, which has wavelengths, atmosphere and detector too, and
+        the weight of the moments of tables, which do not say theirs.
     camera : str or Camera, optional
         By default the telescope's.
     prior : OpticsPrior, optional
@@ -172,6 +177,12 @@ def fit_static_heights(
     StaticHeights
         The mean height, and the plane of the focal plane, are degenerate with the focus of each exposure: they are
         those of the mean of all exposures, within the prior.
+
+    Raises
+    ------
+    DomainError
+        If there are no exposures, the telescope has no camera, or stars were measured under another weight than that of
+        an instrument.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
     if not len(exposures):
@@ -196,7 +207,9 @@ def fit_static_heights(
     states: list[ExposureState | None] = [None] * len(exposures)
     for step in range(max(1, steps)):
         saved_in = None if folder is None else Path(folder)
-        job = _ExposureJob(instrument, height_prior, prior.alignment_rms, heights, saved_in, threads)
+        job = _ExposureJob(
+            instrument, height_prior, prior.alignment_rms, heights, saved_in, threads, instrument is telescope
+        )
         matrix, vector = precision.copy(), -precision @ heights
         with reporter.stage(f"heights, step {step + 1} of {steps}", total=len(exposures)) as stage:
             jobs = [(step, i, exposure, states[i]) for i, exposure in enumerate(exposures)]
@@ -226,19 +239,21 @@ class _ExposureJob:
     heights: np.ndarray
     folder: Path | None
     threads: int | None
+    has_weight: bool  #: whether the weight of the moments is that of the instrument, else that of the stars
 
     def __call__(self, numbered: tuple[int, int, Any, ExposureState | None]) -> HeightEquations:
         step, number, exposure, state = numbered
         stars = stars_of(exposure)
         stars = stars.chosen(stars.usable)
+        instrument = self._under_weight(stars.weight_fwhm, number)
         places = places_of(Mosaic.of_camera(self.prior.camera), stars)
         data = ShapeData(places, stars.values, stars.noise**2)
-        key = self._key(data, state)
+        key = self._key(data, state, instrument)
         path = None if self.folder is None else self.folder / f"exposure_{number:05d}_step_{step}.npz"
         saved_equations = None if path is None else HeightEquations.read(path, key)
         if saved_equations is not None:
             return saved_equations
-        fit = ExposureFit(data, self.instrument, self.prior, self.alignment_rms, self.threads, Reporter(quiet=True))
+        fit = ExposureFit(data, instrument, self.prior, self.alignment_rms, self.threads, Reporter(quiet=True))
         fit.heights = self.heights.copy()
         if state is not None:
             fit.exposure, fit.covariances = state
@@ -254,11 +269,26 @@ class _ExposureJob:
             equations.write(path, key)
         return equations
 
-    def _key(self, data: ShapeData, state: ExposureState | None) -> str:
+    def _under_weight(self, weight_fwhm: float, number: int) -> Instrument:
+        """Return the instrument whose shapes are those under the weight of stars [rad]."""
+        instrument = self.instrument
+        if math.isclose(weight_fwhm, instrument.weight_fwhm, rel_tol=_SAME_WEIGHT):
+            return instrument
+        if not self.has_weight:
+            return replace(instrument, weight_fwhm=weight_fwhm)
+        # Tables do not say theirs.
+        if math.isclose(weight_fwhm, FocalPlaneStars.weight_fwhm, rel_tol=_SAME_WEIGHT):
+            return instrument
+        raise DomainError(
+            f"exposures[{number}]: weight_fwhm of its stars is {weight_fwhm / ARCSEC:.4g} arcsec: expected that of the "
+            f"instrument, {instrument.weight_fwhm / ARCSEC:.4g} arcsec"
+        )
+
+    def _key(self, data: ShapeData, state: ExposureState | None, instrument: Instrument) -> str:
         digest = hashlib.sha256()
         for array in (data.values, data.noise, data.places.xy, data.places.ccd, self.heights):
             digest.update(np.ascontiguousarray(array).tobytes())
-        digest.update(repr((self.alignment_rms, self.instrument.key)).encode())
+        digest.update(repr((self.alignment_rms, instrument.key)).encode())
         if state is not None:
             digest.update(state.exposure.tobytes())
         return digest.hexdigest()

@@ -25,6 +25,7 @@ from ...measure.rho_statistics import RhoStatistics, trace_of_moments
 from ...measure.shapes import Shapes, measure_shapes
 from ..own_stars.own_stars import FEWEST_STARS, fit_own_stars
 from ..own_stars.result import OwnStars, part_of, star_rho_statistics
+from ..psf_model.colour import as_colours
 from ..psf_model.polynomial import as_positions
 from .psf import PiffPsf
 
@@ -153,16 +154,25 @@ def compare_with_piff(
         if in_fit.sum() >= FEWEST_STARS:
             fitted_stars = np.flatnonzero(used)[in_fit]
             fitted_masks = None if masks is None else np.asarray(masks)[fitted_stars]
+            colours = _colours(options, len(places))
+            fitted_options = options if colours is None else options | {"colour": colours[fitted_stars]}
             model = fit_own_stars(
-                np.asarray(stamps)[fitted_stars], places[fitted_stars], scale, masks=fitted_masks, **options
+                np.asarray(stamps)[fitted_stars], places[fitted_stars], scale, masks=fitted_masks, **fitted_options
             ).model
-            rows.append(("pachon, other stars", _measured(pachon_stars, model.at(places[used])), ~in_fit))
+            predicted = model.at(places[used], colour=None if colours is None else colours[used])
+            rows.append(("pachon, other stars", _measured(pachon_stars, predicted), ~in_fit))
         rows.append(("Piff, other stars", theirs, ~in_fit))
     return PiffComparison(
         _stars(pachon_stars, in_fit, theirs),
         _models(shapes, rows),
         {name: _rho(pachon_stars, shapes, model, star_mask, bins) for name, model, star_mask in rows},
     )
+
+
+def _colours(options: Mapping[str, Any], count: int) -> np.ndarray | None:
+    """Return the colours of so many stars among the options of their model; None without any."""
+    colour = options.get("colour")
+    return None if colour is None else np.broadcast_to(as_colours(colour, count), (count,))
 
 
 def _in_fit(psf: PiffPsf, places: np.ndarray, chip: int | None) -> np.ndarray:

@@ -44,9 +44,9 @@ class GivenWorld:
         places, field = stars[:, :2], stars[:, 2:4]
         if len(stars) == 0:
             raise tables.error("no stars with u and v, by which the pointing is found: expected at least one")
-        middle = _sky(wcs, places).mean(axis=0)
+        ra, dec = _middle(_sky(wcs, places))
         u, v = field.mean(axis=0) * ARCSEC
-        start = np.array([middle[0] + u / np.cos(middle[1]), middle[1] - v])
+        start = np.array([ra + u / np.cos(dec), dec - v])
 
         def distances(pointing: np.ndarray) -> np.ndarray:
             return np.asarray(cls(wcs, (pointing[0], pointing[1]), 0.0)._field(places) - field)
@@ -59,7 +59,7 @@ class GivenWorld:
                 f"wcs: puts stars {error:.3g} arcsec from their u, v in the file: expected the WCS{chip_text} of the "
                 "image, within 1 arcsec"
             )
-        return cls(wcs, (float(best.x[0]), float(best.x[1])), error)
+        return cls(wcs, (float(best.x[0] % (2.0 * np.pi)), float(best.x[1])), error)
 
     def at(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return u, v [arcsec], shape [n, 2], and Jacobians [arcsec/pixel], shape [n, 2, 2], at pixels [n, 2]."""
@@ -75,6 +75,14 @@ class GivenWorld:
         u = -np.cos(dec) * np.sin(ra - ra0)
         v = np.cos(dec0) * np.sin(dec) - np.sin(dec0) * np.cos(dec) * np.cos(ra - ra0)
         return np.stack([u, v], axis=1) / cosine[:, None] / ARCSEC
+
+
+def _middle(sky: np.ndarray) -> tuple[float, float]:
+    """Return right ascension and declination of the mean direction of places [n, 2] [rad]."""
+    ra, dec = sky.T
+    # Right ascensions themselves have no mean where they begin anew.
+    x, y, z = (np.mean(part) for part in (np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)))
+    return float(np.arctan2(y, x)), float(np.arctan2(z, np.hypot(x, y)))
 
 
 def _sky(wcs: Any, positions: np.ndarray) -> np.ndarray:

@@ -49,9 +49,9 @@ class Shapelets(Basis):
     ) -> GaussHermite:
         """Return the first `count` + 1 shapelets by total order as a mean and `count` components.
 
-        They are sampled at the centres of the pixels about the centre of the stamp, and restricted to unit sum. The
-        mean is the projection of the mean star: what the shapelets truncate is left out, as in the shapelet method that
-        Jee & Tyson 2011, sec. 3, compare with. ConfigError if the stamps have too few pixels for independent shapelets.
+        They are sampled at the centres of the pixels about the middle one, and restricted to unit sum. The mean is the
+        projection of the mean star: what the shapelets truncate is left out, as in the shapelet method that Jee & Tyson
+        2011, sec. 3, compare with. ConfigError if the stamps have too few pixels for independent shapelets.
         """
         mean, deviations = stars.mean, stars.deviations
         scale = self.scale
@@ -89,14 +89,14 @@ class GaussHermite(FittedBasis, kind=Shapelets):
 def shapelet_images(count: int, shape: tuple[int, int], scale: float) -> np.ndarray:
     """Return the first shapelets by total order, [count, ny, nx], sampled at the centres of the pixels.
 
-    Within an order the one along x comes first. Each has unit square integral over the plane [pixel^-1]. `scale` is the
-    rms width of the Gaussian of order zero [pixel].
+    They are centred on pixel (ny // 2, nx // 2), where stars are. Within an order the one along x comes first. Each has
+    unit square integral over the plane [pixel^-1]. `scale` is the rms width of the Gaussian of order zero [pixel].
     """
     # An order's amplitude is exp(-r^2 / 2 beta^2): the Gaussian of order zero has rms width beta.
     order = 0
     while (order + 1) * (order + 2) // 2 < count:
         order += 1
-    along_y, along_x = (_hermite_functions(order, (np.arange(n) - (n - 1) / 2.0) / scale) for n in shape)
+    along_y, along_x = (_hermite_functions(order, (np.arange(n) - n // 2) / scale) for n in shape)
     pairs = [(total - m, m) for total in range(order + 1) for m in range(total + 1)][:count]
     return np.stack([along_y[m][:, None] * along_x[n] for n, m in pairs]) / scale
 

@@ -44,6 +44,8 @@ def test_stamps_are_those_of_galsim(tmp_path, sampling):
     [
         ({"POLNAME1": "R_MAG"}, "POLNAME1 = 'R_MAG': expected X_IMAGE, the position in pixels"),
         ({"POLNAXIS": 3}, "POLNAXIS = 3: expected 0, or 2"),
+        # Of degrees 2 and 1 there are six products of powers, too.
+        ({"POLNGRP": 2, "POLGRP2": 2, "POLDEG2": 1}, "POLNGRP = 2: expected 1, x and y in one polynomial"),
         ({"POLDEG1": 3}, r"PSF_MASK has shape \(6, 31, 31\): expected 10 images"),
         ({"PSF_SAMP": "half"}, "PSF_SAMP = 'half': expected a number"),
         ({"PSF_SAMP": 0.0}, "PSF_SAMP = 0.0: expected a number above 0"),

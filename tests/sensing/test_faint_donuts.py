@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import pachon
+from pachon.core.errors import DomainError
 from pachon.sensing.flags import DonutFlag
 from pachon.sensing.noise import measured_noise
 from pachon.sensing.seeing import StrengthPrior
@@ -36,6 +37,14 @@ def test_wavefronts_of_a_dark_pupil_are_not_reported(lsst_r):
     """Where a third of the pupil is lit, results were off by 25 um, three times what was claimed."""
     fit = fitted(lsst_r, 6e5, count=2, fields=np.deg2rad([[1.99, 0.2], [2.01, 0.2]]))
     assert fit.flags.tolist() == [DonutFlag.UNDETERMINED] * 2
+
+
+def test_degrees_of_freedom_do_without_donuts_of_dark_pupils(lsst_r):
+    """One of them ended the fit of all in an assertion."""
+    freedoms = pachon.load_degrees_of_freedom("lsst").select(["M2_dz", "M2_dx"])
+    joint = pachon.sensing.TelescopeFreedoms(freedoms)
+    with pytest.raises(DomainError, match="no usable donut: undetermined"):
+        fitted(lsst_r, 6e5, fields=np.deg2rad([[1.965, 0.2]]), fit=joint)
 
 
 def test_few_terms_of_a_faint_donut_are_told(lsst_r):

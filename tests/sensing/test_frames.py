@@ -1,5 +1,7 @@
 """Frames of observatories: pupils, stamps, fields and motions, and the conventions of ts_wep and of DECam's Donut."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from donut_images import donut, noisy
@@ -8,7 +10,7 @@ import pachon
 from pachon.core.errors import ConfigError, DomainError
 from pachon.models.zernike_polynomials import annular_zernikes
 from pachon.sensing.frames import FRAMES, along_camera, stamp_matrix, zernike_matrix
-from pachon.sensing.observatory_zernikes import reexpansion
+from pachon.sensing.observatory_zernikes import observatory_zernikes, reexpansion
 from pachon.sensing.stamp_headers import parallactic_angle
 
 ALL = ("x,y", "y,x", "-x,y", "x,-y", "-y,x", "y,-x", "-x,-y", "-y,-x")
@@ -212,6 +214,26 @@ def test_results_in_conventions_keep_map_and_errors(rotated_fit, focused):
     assert table["Z4"].unit == "um"
     assert table.meta["frame"] == "CCS"
     assert table["field_y"][0].value == pytest.approx(np.rad2deg(lsst.fields[0, 1]))
+
+
+def test_the_design_is_added_where_there_are_results(lsst_r):
+    """One donut outside the field ended the conversion of all in an error."""
+    noll, zernikes = np.arange(4, 12), np.array([np.full(8, 1e-7), np.full(8, np.nan)])
+    fields = np.deg2rad([[0.6, 0.3], [11.0, 0.0]])
+    fit = SimpleNamespace(
+        zernikes=zernikes,
+        covariance=1e-16 * np.stack([np.eye(8)] * 2),
+        noll=noll,
+        fields=fields,
+        wavelengths=np.array([622e-9]),
+        obscuration=lsst_r.pupil_obscuration,
+        projection="zemax",
+    )
+    whole = observatory_zernikes(fit, "pachon", "OCS", pachon.sensing.DonutFrames(), lsst_r, None)
+    own = pachon.wavefront_zernikes(lsst_r, fields[:1], 622e-9, jmax=11).coefficients[:, 3:]
+    np.testing.assert_allclose(whole.values[:1], own + 1e-7, atol=1e-15)
+    assert np.isnan(whole.values[1]).all()
+    assert np.array_equal(fit.zernikes[0], np.full(8, 1e-7))
 
 
 def estimate(telescope, values):

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from donut_images import PIXEL, SIZE, WAVELENGTH, donut
+from scipy.optimize import brentq
+from scipy.special import gamma, j0, kv
 
 import pachon
 from pachon.models.aperture import Complement, Union
@@ -284,6 +286,36 @@ def test_seeing_has_the_width_of_the_long_exposure(outer_scale):
     expected = long_exposure_fwhm(WAVELENGTH, 0.15, min(outer_scale, 1e9))
     assert float(seeing.fwhm(np.array(1.0 / 0.15))) == pytest.approx(expected, rel=2e-3)
     assert seeing.strength(expected) == pytest.approx(1.0 / 0.15, rel=2e-3)
+
+
+@pytest.mark.parametrize(("wavelength", "r0"), [(971e-9, 0.15), (2.2e-6, 0.15), (2.2e-6, 0.4)])
+def test_seeing_of_long_wavelengths(wavelength, r0):
+    """The outer scale leaves a core without width in weak turbulence of the table: the y band ended in an error."""
+    baseline, k = np.linspace(1e-6, 100.0, 20001), 2.0 * np.pi / wavelength
+    x = 2.0 * np.pi * baseline / 25.0
+    # Conan 2000: phase variance 0.0863 (L0/r0)^(5/3), and the transfer function less that of the core.
+    constant = gamma(11.0 / 6.0) * gamma(5.0 / 6.0) / (2.0 * np.pi ** (8.0 / 3.0))
+    constant *= (24.0 / 5.0 * gamma(6.0 / 5.0)) ** (5.0 / 6.0)
+    variance = constant * (25.0 / r0) ** (5.0 / 3.0) * (500e-9 / wavelength) ** 2
+    correlation = 2.0 ** (1.0 / 6.0) / gamma(5.0 / 6.0) * x ** (5.0 / 6.0) * kv(5.0 / 6.0, x)
+    light = baseline * (np.exp(-variance * (1.0 - correlation)) - np.exp(-variance))
+    half = brentq(lambda angle: light @ (j0(k * baseline * angle) - 0.5), 0.0, 2.0 * wavelength / r0)
+    seeing = Seeing(wavelength, 25.0)
+    # Between strengths of the table the width is good to 0.3 %.
+    assert float(seeing.fwhm(np.array(1.0 / r0))) == pytest.approx(2.0 * half, rel=4e-3)
+    assert seeing.strength(2.0 * half) == pytest.approx(1.0 / r0, rel=4e-3)
+
+
+@pytest.mark.parametrize("strength", [4.0, 6.7, 12.0])
+def test_errors_of_the_seeing_are_by_its_slope(strength):
+    """By the ratio of width and strength they were 7 to 14 % too small: the outer scale makes the width steeper."""
+    ends = [long_exposure_fwhm(WAVELENGTH, 1.0 / s, 25.0) for s in (0.99 * strength, 1.01 * strength)]
+    expected = 0.3 * (ends[1] - ends[0]) / (0.02 * strength)
+    found = Seeing(WAVELENGTH, 25.0).fwhm_error(np.array([strength, np.nan]), np.array([0.3, np.nan]))
+    assert found[0] == pytest.approx(expected, rel=5e-3)
+    assert np.isnan(found[1])
+    # Where the seeing is given.
+    assert Seeing(WAVELENGTH, 25.0).fwhm_error(np.array(0.0), np.array(0.0)) == 0.0
 
 
 def test_cells_measure_areas_and_moments(focused):

@@ -258,6 +258,14 @@ def test_donuts_near_the_axis_tell_nothing(focused):
     assert not check.decided
 
 
+def test_the_sky_of_stamps_with_masked_edges():
+    """It was zero, as if the sky had no noise."""
+    variance, edge = np.full((60, 60), 100.0), np.ones((60, 60), dtype=bool)
+    variance[20:40, 20:40], edge[3:-3, 3:-3] = 2000.0, False
+    assert sky_of_variance(variance, edge) == 100.0
+    assert sky_of_variance(variance, np.ones_like(edge)) == 0.0
+
+
 def test_positions_of_a_spreadsheet(tmp_path):
     """Semicolons, and the byte order mark of spreadsheets before the name of the first column."""
     image = np.arange(150.0 * 160.0).reshape(150, 160)

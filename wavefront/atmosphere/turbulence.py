@@ -33,6 +33,10 @@ _PATH_PER_RADIAN = REFERENCE_WAVELENGTH / (2.0 * math.pi)
 # The exponent of the closed forms, and the number of terms with which its series is exact to rounding below unity.
 _NU = 5.0 / 6.0
 _SERIES_TERMS = 10
+# Light of a core of no width that counts as none.
+_LARGEST_CORE = 1e-8
+# Transfer of the light about a core over that of the core, at which it ends.
+_TAIL = 1e-9
 
 
 def fried_parameter(r0: float, wavelength: ArrayLike) -> np.ndarray:
@@ -162,16 +166,24 @@ def long_exposure_otf(
 
 
 def long_exposure_fwhm(
-    wavelength: float, r0: float, outer_scale: float, *, diameter: float | None = None, obscuration: float = 0.0
+    wavelength: float,
+    r0: float,
+    outer_scale: float,
+    *,
+    diameter: float | None = None,
+    obscuration: float = 0.0,
+    halo: bool = False,
 ) -> float:
     """Return the full width at half maximum of an infinitely long exposure [rad].
 
     The point spread function is the Hankel transform of :func:`long_exposure_otf`, by quadrature. Without a pupil,
-    turbulence so weak that the image has a core of no width is a :class:`DomainError`.
+    turbulence so weak that the image has a core of no width is a :class:`DomainError`, unless the width is to be that
+    of the light about this core, the `halo`.
     """
     wavenumber = 2.0 * math.pi / require_positive(wavelength, "wavelength", "metres")
     floor = math.exp(-(wavenumber**2) * path_variance(r0, outer_scale))
-    if diameter is None and floor > 1e-8:
+    core = floor if halo and floor > _LARGEST_CORE else 0.0
+    if diameter is None and floor - core > _LARGEST_CORE:
         raise DomainError(
             f"outer_scale = {outer_scale!r}: with r0 = {r0!r} m expected one so large that no coherent core remains"
             " (give the diameter of the pupil to see that core)"
@@ -180,13 +192,14 @@ def long_exposure_fwhm(
     # Beyond 7 Fried parameters Kolmogorov turbulence has left exp(-88); an outer scale slows that down.
     longest = 7.0 * fried
     while (diameter is None or longest < diameter) and (
-        long_exposure_otf(longest, wavelength, r0, outer_scale) > max(1e-12, 2.0 * floor)
+        long_exposure_otf(longest, wavelength, r0, outer_scale) - core > max(1e-12, 2.0 * (floor - core), _TAIL * core)
     ):
         longest *= 1.5
     if diameter is not None:
         longest = min(longest, diameter)
     b, weight = _gauss_panels(longest, 32)
-    otf = long_exposure_otf(b, wavelength, r0, outer_scale, diameter=diameter, obscuration=obscuration) * b * weight
+    otf = long_exposure_otf(b, wavelength, r0, outer_scale, diameter=diameter, obscuration=obscuration)
+    otf = (otf - core) * b * weight
 
     from scipy.optimize import brentq  # a fifth of a second
 

@@ -188,6 +188,12 @@ def psf_inputs(
     places = np.zeros((len(angles), 2))
     if stamps.offsets is not None:
         places = _finite_pairs(stamps.offsets, "offsets", len(angles))
+        # Images are periodic: that of a star beside its stamp would come in from the other side.
+        if (far := np.abs(places) > 0.5 * stamps.size).any():
+            raise DomainError(
+                f"offsets = {places[far][0]:g}: expected a place on the stamp, at most {0.5 * stamps.size:g} pixels "
+                "from the centre of its middle pixel"
+            )
     shifts = None
     if light.dispersion is not None:
         shifts = _finite_pairs(radians(light.dispersion, "dispersion"), "dispersion", len(waves))

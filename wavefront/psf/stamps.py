@@ -43,7 +43,7 @@ class Stamps:
         Silicon of the CCDs, in which light turns into charge below the surface, and some of it not at all; by default
         all of it does so at the surface.
     offsets : array_like, shape [n_star, 2], optional
-        Place of each star (x, y) from the centre of the middle pixel [pixels]; 0 by default.
+        Place of each star (x, y) on its stamp, from the centre of the middle pixel [pixels]; 0 by default.
     recenter : callable, optional
         Centroids of stamps: given images [n, ny, nx] and the angle of a pixel [rad], it returns places (x, y) from the
         centre of the middle pixel [pixels], shape [n, 2]. Each star is then drawn once more, with its centroid at the

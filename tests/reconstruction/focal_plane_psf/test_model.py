@@ -14,6 +14,7 @@ from pachon.measure.shapes import measure_shapes
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.silicon import Silicon
 from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf, _fit_warnings
+from pachon.reconstruction.focal_plane_psf.mosaic import Mosaic
 from pachon.reconstruction.focal_plane_psf.optics_prior import OpticsPrior
 from pachon.reconstruction.focal_plane_psf.response import Instrument
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
@@ -286,6 +287,17 @@ def test_a_written_model_is_the_same(which, tmp_path, request):
     assert read.evidence == pytest.approx(model.evidence, nan_ok=True, abs=0.0)
     read.write(tmp_path / "again.fits")
     assert (tmp_path / "again.fits").read_bytes() == path.read_bytes()
+
+
+@pytest.mark.long
+def test_a_written_model_has_the_axes_of_its_pixels(tmp_path, blind, exposure):
+    """Of a camera of equal squares they were lost, and x and y of pixels changed places."""
+    mosaic = Mosaic.of_camera(replace(exposure.camera, transposed=True))
+    model = replace(blind, field=replace(blind.field, mosaic=mosaic))
+    model.write(tmp_path / "model.fits")
+    read = FocalPlanePsf.read(tmp_path / "model.fits")
+    pixels = ("R23_S11", [100.0, 3000.0] * u.pix, [2000.0, 500.0] * u.pix)
+    np.testing.assert_array_equal(read.mosaic.places(*pixels).xy, mosaic.places(*pixels).xy)
 
 
 @pytest.mark.long

@@ -182,6 +182,7 @@ STAMPS = np.broadcast_to(star(), (N, SIZE, SIZE))
     [
         *((without(name), {}, [name]) for name in COLUMNS),
         (in_unit("x", u.s), {}, ["x", "s", "m"]),
+        (in_unit("y", u.pix), {}, ["x and y", "both in pixels"]),
         (in_unit("size", u.m), {}, ["size", "rad"]),
         (COLUMNS | {"x": ["a"] * N}, {}, ["x", "numbers"]),
         (COLUMNS | {"y": np.zeros((N, 2))}, {}, ["y", str((N, 2))]),
@@ -243,3 +244,19 @@ def test_bad_files_give_one_clear_line_with_their_name(tmp_path, name):
         FocalPlaneStars.read(tmp_path / name)
     assert "\n" not in str(raised.value)
     assert name in str(raised.value)
+
+
+def test_noise_of_wide_stamps_needs_little_memory(monkeypatch):
+    """All pixels were changed at once: 8 GB of stamps of 181 pixels."""
+    counts, wide = [], np.pad(star(), 12)
+
+    def counted(images, *arguments):
+        counts.append(len(images))
+        return measure_shapes(images, *arguments)
+
+    monkeypatch.setattr("pachon.reconstruction.focal_plane_psf.stars.measure_shapes", counted)
+    found, narrow = (photon_noise(i[None], np.full(1, 1e5), np.full(1, 9.0), PIXEL, WEIGHT) for i in (wide, star()))
+    # Beyond the narrow stamp the weight is 1e-7.
+    np.testing.assert_allclose(found, narrow, rtol=1e-5)
+    assert sum(counts) == wide.size + star().size + 2
+    assert max(counts) <= 1024

@@ -5,6 +5,7 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from pachon.core.errors import DomainError, ProductError
+from pachon.core.units import ARCSEC
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.reconstruction.focal_plane_psf.fit import ExposureFit
 from pachon.reconstruction.focal_plane_psf.heights import powers
@@ -157,6 +158,30 @@ def test_a_written_file_is_the_same(both, tmp_path, exposures):
     prior = read.prior()
     assert prior.mean is read.focal_plane
     assert prior.degree == 6
+
+
+def test_shapes_are_those_under_the_weight_of_the_stars(exposures, lsst_r, wavelengths, monkeypatch):
+    """Under another one they were compared with those under 0.7 arcsec, and heights were wrong in proportion."""
+    used = []
+
+    def stop(self, data, instrument, *arguments):
+        used.append(instrument.weight_fwhm)
+        raise InterruptedError
+
+    monkeypatch.setattr(ExposureFit, "__init__", stop)
+    camera, stars = exposures[0].camera, [exposures[0].stars(weight_fwhm=0.5 * ARCSEC)]
+    with pytest.raises(InterruptedError):
+        fit_static_heights(stars, lsst_r, camera=camera)
+    assert used == [0.5 * ARCSEC]
+    stated = Instrument.of(lsst_r, wavelengths, weight_fwhm=0.6 * ARCSEC)
+    with pytest.raises(
+        DomainError, match=r"^exposures\[0\]: weight_fwhm of its stars is 0\.5 arcsec: expected .* 0\.6"
+    ):
+        fit_static_heights(stars, stated, camera=camera)
+    # Stars of a table, which does not say its weight.
+    with pytest.raises(InterruptedError):
+        fit_static_heights([exposures[0].stars()], stated, camera=camera)
+    assert used[1:] == [0.6 * ARCSEC]
 
 
 def test_bad_input_gives_one_clear_line(lsst_r, tmp_path):

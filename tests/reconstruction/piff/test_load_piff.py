@@ -190,6 +190,25 @@ def test_world_coordinates_that_are_given():
         GivenWorld.fit(stars, None, wcs)
 
 
+@pytest.mark.parametrize(("ra", "dec"), [(0.0, -30.0), (0.0, 0.0), (359.9, 60.0), (120.0, 89.0)])
+def test_given_world_coordinates_where_right_ascension_begins(ra, dec):
+    """The mean of right ascensions on both sides of zero lies on the other side of the sky: images were refused."""
+    wcs, tangent = WCS(naxis=2), WCS(naxis=2)
+    for projection, at in ((wcs, (ra, dec)), (tangent, (ra + 0.02, dec + 0.01))):
+        projection.wcs.ctype, projection.wcs.crval = ["RA---TAN", "DEC--TAN"], at
+    wcs.wcs.crpix, wcs.wcs.cd = [2000.0, 2000.0], np.array([[-7.3e-5, 1e-6], [2e-6, 7.3e-5]])
+    # Pixels of a TAN projection about the pointing, of an arcsecond, are u and v.
+    tangent.wcs.cd = np.diag([-1.0, 1.0]) / 3600.0
+    stars = FewStars(20)
+    sky = wcs.pixel_to_world_values(stars.columns["x"] - 1.0, stars.columns["y"] - 1.0)
+    stars.columns["u"], stars.columns["v"] = np.array(tangent.world_to_pixel_values(*sky)) + 1.0
+    world = GivenWorld.fit(stars, None, wcs)
+    assert world.error < 1e-6
+    difference = np.rad2deg(world.pointing) - tangent.wcs.crval
+    assert (difference[0] + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-8 / np.cos(np.deg2rad(dec)))
+    assert difference[1] == pytest.approx(0.0, abs=1e-8)
+
+
 def test_chips_without_a_given_wcs_are_named():
     with pytest.raises(DomainError, match="wcs has chips 7: expected chip 1 of the file too"):
         pachon.load_piff(DATA / "grid_chips.piff", wcs={7: given_wcs()[0]})

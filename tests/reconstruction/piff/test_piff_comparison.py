@@ -99,6 +99,22 @@ def test_the_command_writes_tables_and_prints_json(stars, found, tmp_path, capsy
     assert capsys.readouterr().err.strip().endswith("none.piff: no such file")
 
 
+@pytest.mark.long
+def test_stars_have_their_colours_in_every_model(psf, stars):
+    """Colours of all stars came to the model of those of Piff's fit alone, which refused them."""
+    stamps, places, image = stars
+    colour = np.random.default_rng(3).uniform(0.0, 1.0, len(places))
+    y, x = np.mgrid[:25, :25] - 12
+    # Wider by 2 % of its variance in a unit of the colour.
+    change = image * (x**2 + y**2 - (image * (x**2 + y**2)).sum() / image.sum())
+    stamps = stamps + 1e6 * 0.02 * (colour - colour.mean())[:, None, None] * change
+    found = pachon.reconstruction.compare_with_piff(psf, stamps, places, size=21, bins=4, colour=colour)
+    plain = pachon.reconstruction.compare_with_piff(psf, stamps, places, size=21, bins=4)
+    assert list(found.models["model"]) == list(plain.models["model"])
+    ours = list(found.models["model"]).index("pachon, other stars")
+    assert found.models["rms_dt"][ours] < 0.3 * plain.models["rms_dt"][ours]
+
+
 def test_a_missing_chip_is_named(stars):
     with pytest.raises(DomainError, match="chip = None: expected one of 1, 2"):
         pachon.reconstruction.compare_with_piff(pachon.load_piff(DATA / "grid_chips.piff"), *stars[:2])

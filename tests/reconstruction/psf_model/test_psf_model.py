@@ -90,6 +90,19 @@ def test_shapelets_are_gauss_hermite_functions():
     np.testing.assert_allclose(flat @ flat.T, np.eye(10), atol=1e-12)
 
 
+@pytest.mark.parametrize("size", [30, 31])
+def test_shapelets_are_centred_where_stars_are(size):
+    """On stamps of an even size they stood half a pixel beside the stars, and left eleven times as much."""
+    y, x = np.mgrid[:size, :size] - size // 2
+    places = positions(20, 2)
+    width = 2.0 + 0.2 * places[:, 0] / 4000.0
+    stars = np.exp(-0.5 * (x**2 + y**2) / width[:, None, None] ** 2)
+    stars /= stars.sum(axis=(1, 2), keepdims=True)
+    model = fit(stars, places, basis="shapelets", n_components=14, order=2, clipping=None)
+    # Gaussians as much as a tenth wider or narrower than that of the basis: terms up to the fourth order leave 1e-5.
+    assert np.sqrt(model.unexplained.mean() / size**2) < 1e-5 * stars.max()
+
+
 def test_shapelets_truncate_the_wings():
     # Moffat wings fall as a power: whatever the scale, a Gaussian times a polynomial leaves part of them
     # (Jee & Tyson 2011, sec. 3), where the mean of the stars holds them.

@@ -259,6 +259,12 @@ def test_configurations_offer_every_engine():
         ({"fields": [[np.nan, 0.0]]}, DomainError, "fields"),
         ({"fields": [[0.0, 0.0, 0.0]]}, DomainError, "fields of shape"),
         ({"stamps": Stamps(offsets=[[0.0, 0.0], [1.0, 1.0]])}, DomainError, "offsets of shape"),
+        # 39 pixels beside a stamp of 31 the star was drawn in its middle.
+        (
+            {"stamps": Stamps(offsets=[[3.0, -15.6]])},
+            DomainError,
+            r"offsets = -15\.6: expected .* at most 15\.5 pixels",
+        ),
         ({"wavelengths": pachon.Light(WAVELENGTHS, dispersion=[[0.0, 0.0]])}, DomainError, "dispersion of shape"),
         ({"focal_plane": "flat", "fields": [[0.0020485, 0.0]]}, DomainError, "between"),
     ],
