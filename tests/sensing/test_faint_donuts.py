@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.core.errors import DomainError
+from pachon.sensing.fit_star import StarFit
 from pachon.sensing.flags import DonutFlag
+from pachon.sensing.light import Instrument
 from pachon.sensing.noise import measured_noise
 from pachon.sensing.seeing import StrengthPrior
+from pachon.sensing.wavefront_fits import WavefrontFit
 from pachon.wavefront.aberration import ResidualWavefront
 
 TERMS = 1e-9 * np.array([60.0, -90.0, 40.0, 70.0, -50.0, 30.0, -80.0, 20.0])
@@ -39,12 +41,13 @@ def test_wavefronts_of_a_dark_pupil_are_not_reported(lsst_r):
     assert fit.flags.tolist() == [DonutFlag.UNDETERMINED] * 2
 
 
-def test_degrees_of_freedom_do_without_donuts_of_dark_pupils(lsst_r):
+def test_degrees_of_freedom_do_without_donuts_that_are_undetermined(lsst_r, monkeypatch):
     """One of them ended the fit of all in an assertion."""
-    freedoms = pachon.load_degrees_of_freedom("lsst").select(["M2_dz", "M2_dx"])
-    joint = pachon.sensing.TelescopeFreedoms(freedoms)
-    with pytest.raises(DomainError, match="no usable donut: undetermined"):
-        fitted(lsst_r, 6e5, fields=np.deg2rad([[1.965, 0.2]]), fit=joint)
+    undetermined = StarFit(DonutFlag.UNDETERMINED)
+    monkeypatch.setattr(WavefrontFit, "prepared", lambda self, instrument, star: undetermined)
+    joint = pachon.sensing.TelescopeFreedoms(pachon.load_degrees_of_freedom("lsst").select(["M2_dz", "M2_dx"]))
+    instrument = Instrument.of(lsst_r, pachon.DonutModel(), joint.terms(lsst_r, None))
+    assert joint.prepared(instrument, StarFit(DonutFlag.OK, best=object())) is undetermined
 
 
 def test_few_terms_of_a_faint_donut_are_told(lsst_r):
