@@ -114,3 +114,34 @@ def test_what_is_linear_in_the_wavefront_covaries_as_its_zernikes():
         np.testing.assert_allclose(values, expected, atol=1e-5 * variance)
     # All stars share the layer on the ground; beyond five outer scales nothing else.
     assert not covariance_by_wavefront(exposed, np.array([[0.2, 0.0]]), [4], np.ones((1, 1, 1))).any()
+
+
+def test_stars_far_apart_across_the_wind_share_nothing():
+    """Frequencies so far apart that the waves of two stars alias made correlations of up to 0.3 at 80 m."""
+    single = replace(
+        air(), altitudes=np.array([1e4]), weights=np.ones(1), velocities=np.array([[10.0, 0.0]]), exposure=15.0
+    )
+    noll, distances = [4, 5, 6], np.array([[0.0, 0.0], [0.0, 20.0], [0.0, 80.0], [20.0, 0.0], [7.0, 7.0]])
+    covariance = mean_wavefront_covariance(single, distances / 1e4, noll, DIAMETER, OBSCURATION)
+    # Modes of a periodic plane of 400 m, by brute force; the pupil a lattice.
+    step, reach = 1.0 / 400.0, 200
+    along = step * np.arange(-reach, reach + 1)
+    axis = (np.arange(40) - 19.5) * DIAMETER / 40
+    x, y = np.meshgrid(axis, axis)
+    inside = (np.hypot(x, y) <= 0.5 * DIAMETER) & (np.hypot(x, y) >= 0.5 * OBSCURATION * DIAMETER)
+    zernikes = np.zeros((len(noll), *inside.shape))
+    values = annular_zernikes(6, x[inside] / (0.5 * DIAMETER), y[inside] / (0.5 * DIAMETER), OBSCURATION)
+    values = values[np.array(noll) - 1]
+    # Without the piston that a lattice leaves in them, of which turbulence has a thousand times as much.
+    values -= values.mean(axis=1, keepdims=True)
+    zernikes[:, inside] = values / np.sqrt((values**2).mean(axis=1, keepdims=True))
+    waves = np.exp(2j * np.pi * np.outer(along, axis))
+    transforms = np.einsum("vy,jyx,ux->jvu", waves, zernikes, waves, optimize=True) / inside.sum()
+    nu_x, nu_y = np.meshgrid(along, along)
+    power = path_spectrum(np.hypot(nu_x, nu_y), 0.16, 25.0) * np.sinc(nu_x * 150.0) ** 2 * step**2
+    for k in range(1, len(distances)):
+        turn = np.cos(2.0 * np.pi * (nu_x * distances[k, 0] + nu_y * distances[k, 1]))
+        expected = (np.abs(transforms) ** 2 * power * turn).sum(axis=(1, 2))
+        found = np.diag(covariance[0, :, k])
+        # The lattice of the pupil is good to 2 % of the variance.
+        np.testing.assert_array_less(np.abs(found - expected), 0.02 * np.diag(covariance[0, :, 0]))
