@@ -18,6 +18,8 @@ from ..core.statistics import RMS_PER_MAD
 
 #: Least and largest variance of light over its amount [units of the image as it came].
 _PHOTON_LIMITS = (0.1, 1e4)
+#: The same over the whole variance of the brightest pixels over their light, for images in units far from electrons.
+_PHOTON_PARTS = (0.1, 2.0)
 #: Groups of pixels of like brightness, of a thousand squares at most in the first.
 _GROUPS = 12
 #: Least number of squares in a group.
@@ -126,7 +128,11 @@ def measured_noise(
     if sky_level > _SKY_LEFT_IN * np.sqrt(of_sky):
         slope = min(slope, of_sky / sky_level)
         sky = max(float((variance - slope * level)[faint].mean()), 0.0)
-    slope = float(np.clip(growth * slope * unit, *_PHOTON_LIMITS)) / unit
+    least, largest = _PHOTON_LIMITS
+    if level[-1] > 0.0 and variance[-1] > 0.0:
+        whole = growth * unit * variance[-1] / level[-1]
+        least, largest = min(least, _PHOTON_PARTS[0] * whole), max(largest, _PHOTON_PARTS[1] * whole)
+    slope = float(np.clip(growth * slope * unit, least, largest)) / unit
     return PixelNoise(growth * sky, slope)
 
 

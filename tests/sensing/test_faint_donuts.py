@@ -77,6 +77,20 @@ def test_noise_of_light_that_is_not_seen_is_bounded():
     assert again.photon * once.photon == pytest.approx(once.photon) == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1e-2, 1e6])
+def test_noise_of_images_in_any_unit(unit):
+    """Of images whose sum is 1 light had 0.1 of itself for variance, and a fit 100 times too large errors."""
+    y, x = np.mgrid[-39.5:40.0, -39.5:40.0]
+    star = 2000.0 * (np.hypot(x, y) < 25.0)
+    noise = np.random.default_rng(3).normal(0.0, np.sqrt(100.0 + star))
+    used = np.ones(star.shape, bool)
+    electrons = measured_noise(noise, star, used, 0.0)
+    assert electrons.photon == pytest.approx(1.0, abs=0.2)
+    other = measured_noise(unit * noise, unit * star, used, 0.0)
+    assert other.photon == pytest.approx(unit * electrons.photon)
+    assert other.sky == pytest.approx(unit**2 * electrons.sky)
+
+
 @pytest.mark.parametrize("strength", [0.5, 3.0, 12.0, 40.0])
 def test_prior_of_the_seeing_has_the_slope_of_its_density(strength):
     prior, step = StrengthPrior(10.0), 1e-5 * strength
