@@ -130,8 +130,8 @@ def measured_noise(
         sky = max(float((variance - slope * level)[faint].mean()), 0.0)
     least, largest = _PHOTON_LIMITS
     if level[-1] > 0.0 and variance[-1] > 0.0:
-        whole = growth * unit * variance[-1] / level[-1]
-        least, largest = min(least, _PHOTON_PARTS[0] * whole), max(largest, _PHOTON_PARTS[1] * whole)
+        ratio = growth * unit * variance[-1] / level[-1]
+        least, largest = min(least, _PHOTON_PARTS[0] * ratio), max(largest, _PHOTON_PARTS[1] * ratio)
     slope = float(np.clip(growth * slope * unit, least, largest)) / unit
     return PixelNoise(growth * sky, slope)
 

@@ -81,7 +81,7 @@ def _middle(sky: np.ndarray) -> tuple[float, float]:
     """Return right ascension and declination of the mean direction of places [n, 2] [rad]."""
     ra, dec = sky.T
     # Right ascensions themselves have no mean where they begin anew.
-    x, y, z = (np.mean(part) for part in (np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)))
+    x, y, z = (np.mean(axis) for axis in (np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)))
     return float(np.arctan2(y, x)), float(np.arctan2(z, np.hypot(x, y)))
 
 
