@@ -30,9 +30,16 @@ from .turbulence import path_spectrum
 
 # Frequencies times the diameter of the pupil: lowest, highest and number, on a logarithmic scale.
 _FREQUENCIES = (0.005, 40.0, 100)
+# The same up to which frequencies follow the waves of two stars: of Z4 to Z11, 0.1 % of the variance lies beyond.
+_FOLLOWED = 4.0
+# Largest distance of two stars' light over the diameter of the pupil that they follow.
+_FARTHEST = 200.0
 # Directions over half the plane: enough for the narrow lobe of a long exposure, which is 1/300 rad wide at 1 cycle/m
 # after 15 s of 20 m/s.
 _DIRECTIONS = 768
+# Values between which frequencies are interpolated, and steps of Newton's from there.
+_TABLE = 4096
+_NEWTON_STEPS = 3
 # Nodes of the integral over the radius of the pupil.
 _RADII = 60
 # Distance, in outer scales, beyond which the light of two stars crosses independent turbulence.
@@ -69,15 +76,16 @@ def mean_wavefront_covariance(
     if not indices.size or indices.min() < 4:
         raise DomainError(f"noll = {indices.tolist()}: expected Noll indices from 4")
     slopes = np.atleast_2d(np.asarray(fields, dtype=np.float64))
-    low, high, count = _FREQUENCIES
-    frequency = np.geomspace(low, high, count) / diameter
+    n_star, n_noll = len(slopes), len(indices)
+    lags = (slopes[:, None] - slopes).reshape(-1, 2)
+    farthest = _farthest(atmosphere.altitudes, lags, atmosphere.outer_scale, diameter)
+    frequency, width = (values / diameter for values in _frequencies(farthest))
     angle = _directions()
-    transform = _zernike_transforms(tuple(indices.tolist()), obscuration)
+    transform = _zernike_transforms(tuple(indices.tolist()), obscuration, farthest)
     plane = frequency[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     # The other half of the plane is the complex conjugate.
-    area = 2.0 * (np.log(high / low) / (count - 1)) * (np.pi / _DIRECTIONS) * frequency**2
+    area = 2.0 * (np.pi / _DIRECTIONS) * frequency * width
     power = area * path_spectrum(frequency, atmosphere.r0, atmosphere.outer_scale)
-    n_star, n_noll = len(slopes), len(indices)
     covariance = np.zeros((n_star, n_noll, n_star, n_noll))
     velocities = np.reshape(atmosphere.velocities, (-1, 2))
     for altitude, weight, velocity in zip(atmosphere.altitudes, atmosphere.weights, velocities, strict=True):
@@ -118,12 +126,12 @@ def covariance_by_wavefront(air: ExposedAir, lags: np.ndarray, noll: ArrayLike, 
     ndarray, shape [n_lag, n_pair]
         Mean over a lag and its opposite.
     """
-    low, high, count = _FREQUENCIES
-    frequency, angle = np.geomspace(low, high, count) / air.diameter, _directions()
+    farthest, angle = _farthest(air.altitudes, lags, air.outer_scale, air.diameter), _directions()
+    frequency, width = (values / air.diameter for values in _frequencies(farthest))
     plane = (frequency[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
     indices = tuple(np.atleast_1d(np.asarray(noll, dtype=np.int64)).tolist())
-    transform = _zernike_transforms(indices, air.obscuration).reshape(len(plane), len(indices))
-    area = 2.0 * (np.log(high / low) / (count - 1)) * (np.pi / _DIRECTIONS) * frequency**2
+    transform = _zernike_transforms(indices, air.obscuration, farthest).reshape(len(plane), len(indices))
+    area = 2.0 * (np.pi / _DIRECTIONS) * frequency * width
     power = np.repeat(area * path_spectrum(frequency, air.r0, air.outer_scale), _DIRECTIONS)
     spectra = np.stack([((transform @ matrix) * transform.conj()).sum(axis=1).real for matrix in products], axis=1)
     spectra *= power[:, None]
@@ -142,14 +150,55 @@ def covariance_by_wavefront(air: ExposedAir, lags: np.ndarray, noll: ArrayLike, 
     return out
 
 
+def _farthest(altitudes: ArrayLike, lags: np.ndarray, outer_scale: float, diameter: float) -> float:
+    """Return the distance that frequencies have to follow, over the diameter of the pupil.
+
+    Of stars that are lags [n, 2] [rad] apart it is the largest one in layers at altitudes [m] at which they share
+    turbulence, rounded up to a power of two: few transforms are then computed anew.
+    """
+    distances = np.multiply.outer(np.asarray(altitudes, dtype=np.float64), np.hypot(*lags.T)) / diameter
+    shared = distances[(distances > 0.0) & (distances <= _INDEPENDENT * outer_scale / diameter)]
+    return float(min(2.0 ** np.ceil(np.log2(shared.max())), _FARTHEST)) if shared.size else 0.0
+
+
+@lru_cache(maxsize=4)
+def _frequencies(farthest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return frequencies times the diameter of the pupil, and the intervals that they stand for, [n_frequency] both.
+
+    They stand on a logarithmic scale, but closer where the waves of two stars so many diameters apart would alias:
+    beyond a few cycles a diameter little is left. The trapezoidal rule in a smooth function of the frequency is right
+    to all orders.
+    """
+    low, high, count = _FREQUENCIES
+    step = np.log(high / low) / (count - 1)
+    frequency = np.geomspace(low, high, count)
+    if not farthest:
+        return frequency, step * frequency
+    closest = 1.0 / (2.0 * farthest + 4.0)
+
+    def interval(frequency: np.ndarray) -> np.ndarray:
+        return np.asarray(1.0 / (1.0 / (step * frequency) + 1.0 / (closest * (1.0 + (frequency / _FOLLOWED) ** 2))))
+
+    def number(frequency: np.ndarray) -> np.ndarray:
+        return np.asarray(np.log(frequency) / step + _FOLLOWED / closest * np.arctan(frequency / _FOLLOWED))
+
+    first, last = number(frequency[[0, -1]])
+    numbers = np.linspace(first, last, int(np.ceil(last - first)) + 1)
+    table = np.geomspace(low, high, _TABLE)
+    frequency = np.interp(numbers, number(table), table)
+    for _ in range(_NEWTON_STEPS):
+        frequency = frequency - (number(frequency) - numbers) * interval(frequency)
+    return frequency, interval(frequency) * (numbers[1] - numbers[0])
+
+
 @lru_cache(maxsize=2)
-def _zernike_transforms(indices: tuple[int, ...], obscuration: float) -> np.ndarray:
+def _zernike_transforms(indices: tuple[int, ...], obscuration: float, farthest: float) -> np.ndarray:
     """Return means over the annulus of Zernikes times a plane wave, [n_frequency, n_angle, n_noll].
 
-    They are at the frequencies and directions of :func:`mean_wavefront_covariance`, which are stored, as they do not
-    depend on the atmosphere.
+    They are at the frequencies of :func:`_frequencies` and the directions of :func:`mean_wavefront_covariance`, which
+    are stored, as they do not depend on the atmosphere.
     """
-    frequency, angle = 0.5 * np.geomspace(*_FREQUENCIES), _directions()
+    frequency, angle = 0.5 * _frequencies(farthest)[0], _directions()
     out = np.empty((len(frequency), len(angle), len(indices)), dtype=np.complex128)
     for k, j in enumerate(indices):
         _, m = noll_to_nm(j)
