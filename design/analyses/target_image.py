@@ -227,6 +227,7 @@ def target_image(
 def _landings(request: Request, picture: np.ndarray, step: float) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
     """Yield weight of a wavelength, landing points [n, 2] of lit rays and their light, some pixels at a time."""
     telescope, count = request.telescope, len(request.pupil)
+    points = request.vignetted(request.pupil.points).reshape(-1, count, 2)[0]
     row, column = np.nonzero(picture)
     middle = 0.5 * (np.array(picture.shape) - 1)
     offset = np.stack([column - middle[1], row - middle[0]], axis=-1)
@@ -238,7 +239,7 @@ def _landings(request: Request, picture: np.ndarray, step: float) -> Iterator[tu
         angles = request.fields[0] + step * (offset[batch, None] + within)
         telescope.check_field(angles[..., 0], angles[..., 1])
         directions = field_direction(angles[..., 0].ravel(), angles[..., 1].ravel(), request.projection)
-        pupil = np.tile(request.pupil.points, (len(angles), 1))[:, None]
+        pupil = np.tile(points, (len(angles), 1))[:, None]
         light = np.repeat(picture[row[batch], column[batch]] / count, count)
         for wavelength, weight in zip(request.wavelengths, request.weights, strict=True):
             rays = launch_bundles(telescope, directions, float(wavelength), pupil)
