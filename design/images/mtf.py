@@ -239,8 +239,9 @@ def mtf(
 
 def tangential_angle(telescope: Telescope, principal: PrincipalRays) -> np.ndarray:
     """Return the angle from the x axis of the detector to the tangential direction [rad], shape [n_field]."""
-    ends = telescope.surfaces[-1].along(principal.marginal_direction)
-    across = ends[:, 0, :2] - ends[:, 1, :2]
+    # An ideal lens takes parallel light from places on it to directions opposite to them.
+    ends = -principal.marginal_position if telescope.design_data.afocal else principal.marginal_direction
+    across = telescope.surfaces[-1].along(ends[:, 0] - ends[:, 1])
     return np.arctan2(across[:, 1], across[:, 0])
 
 
