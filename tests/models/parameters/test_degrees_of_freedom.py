@@ -277,6 +277,14 @@ def test_a_warm_shape_is_a_larger_one(lsst_r, shape):
     assert np.abs(shape.sag(x, y) - grown).max() > 1e-8
 
 
+def test_lines_of_a_warm_grating_are_farther_apart(lsst_r):
+    grating = pachon.models.Grating(1, 100.0)
+    surfaces = tuple(dataclasses.replace(s, grating=grating if s.name == "M2" else None) for s in lsst_r.surfaces)
+    telescope = dataclasses.replace(lsst_r, surfaces=surfaces)
+    warm = DegreesOfFreedom((thermal(telescope, {"M2": 2e-5}),)).apply(telescope, [10.0])
+    assert warm.surface("M2").grating.lines_per_mm == pytest.approx(100.0 * (1.0 - 2e-4), rel=1e-12)
+
+
 def test_powers_of_lengths():
     shape = EvenAsphere(2.0, -1.0, (0.0, 3.0))
     surface = pachon.load_telescope("lsst_v3.3_r").surface("M1")
