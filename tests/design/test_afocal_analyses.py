@@ -4,15 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from scipy.special import j0, j1
 
 import pachon
+from pachon.commands.cli import main
 from pachon.core.errors import DomainError, PrescriptionError, PrescriptionWarning
 from pachon.design.images.mtf import tangential_angle
 from pachon.design.optimize.jacobian import ParameterColumns
 from pachon.design.optimize.merit import Beams, SpotMerit, WavefrontMerit
 from pachon.models.design_data import DesignData
 from pachon.models.first_order import first_order
+from pachon.models.io.prescription import save_telescope
 from pachon.models.media.medium import ConstantIndex
 from pachon.models.parameters.parameters import parse_parameters
 from pachon.models.shapes.shape import Conic, Plane
@@ -314,3 +317,13 @@ def test_the_tangential_direction_of_transfer_is_that_of_the_field():
     fields = 2e-3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     found = tangential_angle(telescope, pachon.design.principal_rays(telescope, fields))
     assert np.sin(found - angle) == pytest.approx(np.zeros(4), abs=1e-5)
+
+
+def test_files_of_images_say_that_pixels_are_angles(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_telescope(expander(), "expander.yaml")
+    assert (
+        main(["psf", "expander.yaml", "--field-deg", "0", "--pixels", "16", "--pupil-points", "32", "-o", "p.fits"])
+        == 0
+    )
+    assert fits.getheader("p.fits").comments["PIXEL"] == "[urad] distance of pixel centres"
