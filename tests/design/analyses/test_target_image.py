@@ -62,5 +62,7 @@ def test_bad_targets(paraboloid):
     for target, problem in ((np.zeros((4, 4)), "some light"), (np.ones(4), "shape"), (-np.ones((3, 3)), "negative")):
         with pytest.raises(DomainError, match=problem):
             pachon.design.target_image(paraboloid(), target)
+    with pytest.raises(DomainError, match=r"^field: 2 fields are given; expected one$"):
+        pachon.design.target_image(pachon.Request.of(paraboloid(), [[0.0, 0.0], [0.0, 1e-3]]))
     with pytest.raises(DomainError, match="bars = 9"):
         pachon.design.bar_target(64, bars=9)
