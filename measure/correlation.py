@@ -254,7 +254,7 @@ def shear_correlation(
         A second ellipticity (f1, f2) of the same stars: xi+ becomes the mean of ``Re(e f'* + f e'*) / 2`` over the
         pairs, and xi- that of Re((e f' + f e') exp(-4 i phi)) / 2.
     weight : array, optional
-        Weight of each star, not negative; a pair has the product of two. Equal by default.
+        Weight of each star; a pair has the product of two. Stars of weight 0 are left out. Equal by default.
 
     Raises
     ------
@@ -281,7 +281,7 @@ def shear_correlation(
         raise DomainError("patch has masked labels: expected one for each star")
     if labels is not None and labels.shape != columns[0].shape:
         raise DomainError(f"patch has shape {labels.shape}: expected {columns[0].shape}, one for each star")
-    usable = np.all(np.isfinite(columns), axis=0)
+    usable = np.all(np.isfinite(columns), axis=0) & (True if weight is None else weights > 0.0)
     n_stars = int(usable.sum())
     if n_stars < 2:
         raise DomainError(f"e1, e2: {n_stars} of {len(usable)} stars are usable, expected at least 2")
@@ -312,6 +312,8 @@ def shear_correlation(
     if labels is None:
         leave_one_out_xi, leave_one_out_pairs = np.empty((2, 0, bins.n_bins)), np.empty((0, bins.n_bins))
         errors = np.sqrt(np.stack([pairs.varxip, pairs.varxim]))
+        if other is not None:
+            errors *= _factors_of_two(g, of_stars.get("w"))[:, None]
     else:
         leave_one_out_xi, leave_one_out_pairs = _leave_one_out_correlations(pairs, len(patch_labels))
         errors = np.stack([jackknife_error(values) for values in leave_one_out_xi])
@@ -339,6 +341,21 @@ def jackknife_error(leave_one_out: np.ndarray) -> np.ndarray:
     """Return standard errors from values without each patch, [n_patches, ...]; NaN where one of the values is."""
     scatter = ((leave_one_out - leave_one_out.mean(axis=0)) ** 2).sum(axis=0)
     return np.asarray(np.sqrt((1.0 - 1.0 / len(leave_one_out)) * scatter))
+
+
+def _factors_of_two(g: list[np.ndarray], weight: np.ndarray | None) -> np.ndarray:
+    """Return the factors of TreeCorr's errors of xi+ and xi- of two ellipticities of the same stars, [2].
+
+    It takes e f'* and f e'* of a pair as independent. Their covariance is that of e and f squared, which of equal ones
+    makes the error that of a single ellipticity.
+    """
+    e, f = (v - np.average(v, weights=weight) for v in (g[0] + 1j * g[1], g[2] + 1j * g[3]))
+    squares = 1.0 if weight is None else weight**2
+    norm = (squares * np.abs(e) ** 2).sum() * (squares * np.abs(f) ** 2).sum()
+    covariance = (squares * e * f.conj()).sum()
+    if not norm > 0.0:
+        return np.ones(2)
+    return np.asarray(np.sqrt(1.0 + np.array([(covariance**2).real, np.abs(covariance) ** 2]) / norm))
 
 
 def _leave_one_out_correlations(pairs: treecorr.GGCorrelation, n_patches: int) -> tuple[np.ndarray, np.ndarray]:
