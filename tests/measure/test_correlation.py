@@ -145,6 +145,16 @@ def test_stars_without_weight_are_left_out():
         shear_correlation(x, y, e1, e2, bins=BINS, weight=np.zeros(60), subtract_mean=True)
 
 
+def test_means_over_ranges_count_pairs_by_their_weights():
+    """The mean over bins is xi+ of one bin as wide as all of them, jackknife included."""
+    x, y, e1, e2 = catalogue(80)
+    options = {"weight": np.random.default_rng(10).uniform(0.0, 1.0, 80) ** 4, "patch": np.arange(80) // 16}
+    many = shear_correlation(x, y, e1, e2, bins=SeparationBins(1.0 * ARCMIN, 9.0 * ARCMIN, 6), **options)
+    one = shear_correlation(x, y, e1, e2, bins=SeparationBins(1.0 * ARCMIN, 9.0 * ARCMIN, 1), **options)
+    assert many.mean_xi_plus("short") == pytest.approx(one.xi_plus[0], rel=1e-6)
+    assert many.error_mean_xi_plus("short") == pytest.approx(one.error_plus[0], rel=1e-5)
+
+
 def test_cells_agree_with_pairs():
     x, y, e1, e2 = catalogue(3000)
     pairs = shear_correlation(x, y, e1, e2, bins=BINS)
