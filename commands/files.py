@@ -107,8 +107,8 @@ def schema_command(
         str,
         choice(
             (
-                *("prescription", "run", "sweep", "images", "visits", "align", "site", "coatings", "tolerances"),
-                *("optimization", "degrees_of_freedom", "camera"),
+                *("prescription", "run", "sweep", "images", "visits", "night", "align", "site", "coatings"),
+                *("tolerances", "optimization", "degrees_of_freedom", "camera"),
             ),
             metavar="KIND",
             help="Kind of file.",

@@ -14,7 +14,7 @@ from ..core.errors import ConfigError, DomainError, shown
 from ..core.products import Card, Stamp, card_text
 from ..core.units import ARCSEC
 from ..pipeline.experiment import Experiment
-from ..pipeline.listed_visit import observation_cards
+from ..pipeline.listed_visit import nominal_dates, observation_cards
 from ..pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from ..pipeline.simulate.photometry import effective_fwhm
 from ..reconstruction.psf_model.interpolation import Interpolation
@@ -82,6 +82,8 @@ class CcdScene:
         ):
             header[key] = (value, comment)
         header.extend(self.cards, update=True)
+        if "VISIT" not in header and self.cards:
+            header.extend(nominal_dates(settings.total_time), update=True)
         objects = self.objects if ratio == 1.0 else self.objects | {"FLUX": self.objects["FLUX"] * ratio}
         return CcdImage(self.name, ccd_image.image, ccd_image.variance, ccd_image.mask, header, objects)
 

@@ -106,6 +106,10 @@ class Correlation(Result):
         xi+ without each patch in turn, from which follow errors of whatever is made of xi+; NaN where no pair is left.
     leave_one_out_pairs : array of int, shape [n_patches, n_bins]
         Pairs without each patch.
+    pair_weights : array, optional
+        Sums of the weights of the pairs of each bin; None of equal ones.
+    leave_one_out_weights : array, shape [n_patches, n_bins], optional
+        The same without each patch.
     """
 
     _table = ("r", "xi_plus", "error_plus", "xi_minus", "error_minus", "n_pairs")
@@ -120,6 +124,8 @@ class Correlation(Result):
     n_patches: int = 0
     leave_one_out_plus: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
     leave_one_out_pairs: np.ndarray = field(default_factory=lambda: np.empty((0, 0), dtype=np.int64))
+    pair_weights: np.ndarray | None = None
+    leave_one_out_weights: np.ndarray | None = None
 
     @property
     def r_arcmin(self) -> np.ndarray:
@@ -156,7 +162,7 @@ class Correlation(Result):
 
     @check_arguments
     def mean_xi_plus(self, separations: SeparationRange) -> float:
-        """Return the mean of xi+ over the pairs of a range of separations.
+        """Return the mean of xi+ over the pairs of a range of separations, by their weights where they have any.
 
         Parameters
         ----------
@@ -168,12 +174,14 @@ class Correlation(Result):
         float
             NaN where there are no pairs.
         """
-        return float(self._mean_over_pairs(separations, self.n_pairs, self.xi_plus))
+        pairs = self.n_pairs if self.pair_weights is None else self.pair_weights
+        return float(self._mean_over_pairs(separations, pairs, self.xi_plus))
 
     @check_arguments
     def leave_one_out_mean_xi_plus(self, separations: SeparationRange) -> np.ndarray:
         """Return :meth:`mean_xi_plus` without each patch in turn, [n_patches]."""
-        return self._mean_over_pairs(separations, self.leave_one_out_pairs, self.leave_one_out_plus)
+        pairs = self.leave_one_out_pairs if self.leave_one_out_weights is None else self.leave_one_out_weights
+        return self._mean_over_pairs(separations, pairs, self.leave_one_out_plus)
 
     @check_arguments
     def error_mean_xi_plus(self, separations: SeparationRange) -> float:
@@ -254,7 +262,7 @@ def shear_correlation(
         A second ellipticity (f1, f2) of the same stars: xi+ becomes the mean of ``Re(e f'* + f e'*) / 2`` over the
         pairs, and xi- that of Re((e f' + f e') exp(-4 i phi)) / 2.
     weight : array, optional
-        Weight of each star, not negative; a pair has the product of two. Equal by default.
+        Weight of each star; a pair has the product of two. Stars of weight 0 are left out. Equal by default.
 
     Raises
     ------
@@ -281,7 +289,7 @@ def shear_correlation(
         raise DomainError("patch has masked labels: expected one for each star")
     if labels is not None and labels.shape != columns[0].shape:
         raise DomainError(f"patch has shape {labels.shape}: expected {columns[0].shape}, one for each star")
-    usable = np.all(np.isfinite(columns), axis=0)
+    usable = np.all(np.isfinite(columns), axis=0) & (True if weight is None else weights > 0.0)
     n_stars = int(usable.sum())
     if n_stars < 2:
         raise DomainError(f"e1, e2: {n_stars} of {len(usable)} stars are usable, expected at least 2")
@@ -311,9 +319,14 @@ def shear_correlation(
     empty = pairs.npairs == 0
     if labels is None:
         leave_one_out_xi, leave_one_out_pairs = np.empty((2, 0, bins.n_bins)), np.empty((0, bins.n_bins))
+        leave_one_out_weights = leave_one_out_pairs
         errors = np.sqrt(np.stack([pairs.varxip, pairs.varxim]))
+        if other is not None:
+            errors *= _factors_of_two(g, of_stars.get("w"))[:, None]
     else:
-        leave_one_out_xi, leave_one_out_pairs = _leave_one_out_correlations(pairs, len(patch_labels))
+        leave_one_out_xi, leave_one_out_pairs, leave_one_out_weights = _leave_one_out_correlations(
+            pairs, len(patch_labels)
+        )
         errors = np.stack([jackknife_error(values) for values in leave_one_out_xi])
     return Correlation(
         r=np.where(empty, pairs.rnom, pairs.meanr),
@@ -327,6 +340,8 @@ def shear_correlation(
         n_patches=leave_one_out_xi.shape[1],
         leave_one_out_plus=leave_one_out_xi[0],
         leave_one_out_pairs=np.rint(leave_one_out_pairs / len(catalogs)).astype(np.int64),
+        pair_weights=None if weight is None else pairs.weight / len(catalogs),
+        leave_one_out_weights=None if weight is None else leave_one_out_weights / len(catalogs),
     )
 
 
@@ -341,8 +356,27 @@ def jackknife_error(leave_one_out: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt((1.0 - 1.0 / len(leave_one_out)) * scatter))
 
 
-def _leave_one_out_correlations(pairs: treecorr.GGCorrelation, n_patches: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return xi+ and xi- without each patch in turn, [2, n_patches, n_bins], and the pairs [n_patches, n_bins] left.
+def _factors_of_two(g: list[np.ndarray], weight: np.ndarray | None) -> np.ndarray:
+    """Return the factors of TreeCorr's errors of xi+ and xi- of two ellipticities of the same stars, [2].
+
+    It takes e f'* and f e'* of a pair as independent. Their covariance is that of e and f squared, which of equal ones
+    makes the error that of a single ellipticity.
+    """
+    e, f = (v - np.average(v, weights=weight) for v in (g[0] + 1j * g[1], g[2] + 1j * g[3]))
+    squares = 1.0 if weight is None else weight**2
+    norm = (squares * np.abs(e) ** 2).sum() * (squares * np.abs(f) ** 2).sum()
+    covariance = (squares * e * f.conj()).sum()
+    if not norm > 0.0:
+        return np.ones(2)
+    return np.asarray(np.sqrt(1.0 + np.array([(covariance**2).real, np.abs(covariance) ** 2]) / norm))
+
+
+def _leave_one_out_correlations(
+    pairs: treecorr.GGCorrelation, n_patches: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return xi+ and xi- without each patch in turn, [2, n_patches, n_bins], and pairs and weights that are left.
+
+    The latter are [n_patches, n_bins].
 
     NaN where no pair is left. TreeCorr adds up the pairs of patches anew without each of them, which takes the third
     power of their number, 20 s for 189; here the pairs of each patch are subtracted from the sum of all.
@@ -355,4 +389,5 @@ def _leave_one_out_correlations(pairs: treecorr.GGCorrelation, n_patches: int) -
     n_pairs, weight, plus, minus = np.moveaxis(sums[0] - sums[1:], 1, 0)
     # Numbers of pairs are whole and so exactly zero where none is left.
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(n_pairs > 0, np.stack([plus, minus]) / weight, np.nan), n_pairs
+        xi = np.where(n_pairs > 0, np.stack([plus, minus]) / weight, np.nan)
+    return xi, n_pairs, np.where(n_pairs > 0, weight, 0.0)

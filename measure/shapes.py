@@ -188,7 +188,7 @@ def measure_shapes(
         bad = bad_pixels(pixels) if weightless is None else weightless[i : i + batch]
         pixels -= level[i : i + batch, None, None]
         if bad.any():
-            parts.append(_measure_masked(pixels, bad, scale, sigma, max_iterations, tolerance))
+            parts.append(_measure_masked(pixels, bad, scale, sigma, max_iterations, tolerance, starts[i : i + batch]))
         else:
             parts.append(_measure_batch(pixels, scale, sigma, max_iterations, tolerance, starts[i : i + batch]))
     if not parts:
@@ -282,17 +282,25 @@ def _measure_batch(
 
 
 def _measure_masked(
-    images: np.ndarray, bad: np.ndarray, scale: float, sigma: float, max_iterations: int, tolerance: float
+    images: np.ndarray,
+    bad: np.ndarray,
+    scale: float,
+    sigma: float,
+    max_iterations: int,
+    tolerance: float,
+    starts: np.ndarray,
 ) -> Shapes:
-    """Measure a batch whose bad pixels, bool [n, ny, nx], have no weight."""
+    """Measure a batch whose bad pixels, bool [n, ny, nx], have no weight; `starts` are those of the other images."""
     masked = np.flatnonzero(bad.any(axis=(1, 2)))
+    starts = starts.copy()
+    starts[masked] = 0.0
 
     def moments(filled: np.ndarray) -> MaskedMoments:
         shapes = _measure_batch(filled, scale, sigma, max_iterations, tolerance)
         return MaskedMoments(shapes.x, shapes.y, shapes.e1, shapes.e2, shapes.size / scale)
 
     images[masked], lost = fill_by_moments(images[masked], bad[masked], moments, sigma)
-    shapes = _measure_batch(images, scale, sigma, max_iterations, tolerance)
+    shapes = _measure_batch(images, scale, sigma, max_iterations, tolerance, starts)
     lost_stars = masked[lost]
     shapes.flags[lost_stars] |= ShapeFlag.MASKED
     for values in (shapes.e1, shapes.e2, shapes.size, shapes.x, shapes.y):

@@ -147,7 +147,7 @@ def center_stamps(
 
 def with_unit_sum(stamps: np.ndarray) -> np.ndarray:
     """Return stamps [n, ny, nx] over their sums; all NaN where that is not positive."""
-    total = stamps.reshape(len(stamps), -1).sum(axis=1)
+    total = stamps.reshape(len(stamps), stamps.shape[1] * stamps.shape[2]).sum(axis=1)
     return np.asarray(stamps / np.where(total > 0.0, total, np.nan)[:, None, None])
 
 

@@ -181,10 +181,17 @@ def observation_cards(experiment: Experiment, ccd: str, exposure: float) -> list
     The date is the epoch J2000, at which positions of catalogues need no proper motion, to the middle of an exposure
     [s], all of a sum together.
     """
-    comment = "nominal: of no visit"
     return visit_cards(experiment, ccd) or [
         ("INSTRUME", instrument_of(experiment.camera), "camera"),
         ("DETECTOR", experiment.camera.ccd_index(ccd), "number of the CCD in the camera, from 0"),
+        *nominal_dates(exposure),
+    ]
+
+
+def nominal_dates(exposure: float) -> list[Card]:
+    """Return the cards of the nominal date of an exposure [s] of no visit."""
+    comment = "nominal: of no visit"
+    return [
         ("TIMESYS", "TAI", "of all times"),
         ("DATE-OBS", _date_of(_J2000), comment),
         ("MJD-OBS", _J2000, f"[d] {comment}"),

@@ -32,13 +32,14 @@ def screen_bytes(experiment: Experiment) -> int:
 def needed_bytes(experiment: Experiment, threads: int | None = None) -> int:
     """Return an estimate of the peak memory of a run [bytes]."""
     config = experiment.config
-    stars = config.stars.truth + max(map(experiment.observed_count, resolved_value(config.ccds)))
+    observed_counts = [experiment.observed_count(name) for name in resolved_value(config.ccds)]
+    stars = config.stars.truth + max(observed_counts)
     workers = thread_count(threads) if config.psf.engine == "wave" else 0
     stamps = stars * experiment.stamp_size**2 * _STAMP_BYTES
     of_worker = _WAVE_THREAD + (0 if experiment.silicon is None else _SILICON_THREAD)
     # The report holds the PSF model of every CCD; one without components stores each star, and its weight in kriging.
-    stored_stars = 0 if config.reconstruction.psf_recipe().basis.has_components else config.stars.observed
-    models = 16 * len(resolved_value(config.ccds)) * stored_stars * experiment.stamp_size**2
+    stored_stars = 0 if config.reconstruction.psf_recipe().basis.has_components else sum(observed_counts)
+    models = 16 * stored_stars * experiment.stamp_size**2
     return max(_REPORT + models, _BASE + screen_bytes(experiment) + workers * of_worker + stamps)
 
 

@@ -46,8 +46,9 @@ def resolved_photometry(
             camera_band = camera.photometry.band(camera.name, band, area, ends)
         values = {key: getattr(camera_band, name) for key, name in _SAME.items()}
     if "pixel_arcsec" in open_keys:
-        # To a thousandth, as cameras state it: 0.2 for the LSST.
-        values["pixel_arcsec"] = round(pixel_angle(telescope, camera.pixel_size) / ARCSEC, 3)
+        # To a thousandth, as cameras state it: 0.2 for the LSST; smaller ones to three digits.
+        pixel_arcsec = pixel_angle(telescope, camera.pixel_size) / ARCSEC
+        values["pixel_arcsec"] = round(pixel_arcsec, max(3, 2 - math.floor(math.log10(pixel_arcsec))))
     return section.model_copy(update={key: values[key] for key in open_keys})
 
 

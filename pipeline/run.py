@@ -26,7 +26,7 @@ from .focal_plane_stage import apply_focal_plane_model, write_focal_plane_model
 from .memory import check_memory
 from .report.focal_plane_files import write_focal_plane
 from .report.report import build_report
-from .run_folder import SUMMARY_NAME, claim_run, finished_ccds, stamp_of
+from .run_folder import SUMMARY_NAME, claim_run, finished_ccds, read_reasons, stamp_of, write_reasons
 from .simulate.ccd_loop import check_catalogue
 from .summary import correlations, run_metrics
 
@@ -88,7 +88,7 @@ def run(
     part : (i, n)
         Compute the i-th of n parts of the CCDs, of 1 to n; parts run side by side, on several machines, in one folder.
         Finished CCDs are kept, as on resuming, and the part that ends last writes the report. Parts beyond the number
-        of CCDs have nothing to compute.
+        of CCDs have nothing to compute. Files not_modelled_CCD.json tell parts of CCDs that cannot be modelled.
     execution : Execution, optional
         Workers that compute the CCDs, threads, whether to keep finished CCDs and add to them, and progress display.
 
@@ -130,7 +130,10 @@ def run(
             # Other parts may have ended meanwhile.
             other_ccds = [name for name in names if name not in (*finished_names, *unfinished_ccds)]
             finished = finished_ccds(folder, experiment, other_ccds)
-            unfinished = tuple(name for name in other_ccds if name not in finished)
+            write_reasons(folder, experiment, unfinished_ccds, failed)
+            other_failures = read_reasons(folder, experiment, set(other_ccds).difference(finished))
+            unfinished = tuple(name for name in other_ccds if name not in (*finished, *other_failures))
+            failed = {name: reason for name in names if (reason := (failed | other_failures).get(name)) is not None}
             if unfinished:
                 return RunResult(folder, None, {}, finished_names, computed, failed, unfinished)
         with reporter.stage("focal plane"):

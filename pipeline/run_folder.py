@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ..core.errors import PachonError
+from ..core.files import write_json
 from ..core.long_work import claim_folder
 from ..core.products import Card, Stamp, is_whole
 from ..core.version import VERSION
@@ -48,6 +51,31 @@ def finished_ccds(folder: Path, experiment: Experiment, names: Iterable[str] | N
     """Return the CCDs of a run, or those among some names, with complete products of this configuration."""
     stamp, names = stamp_of(experiment), (experiment.config.ccds or ()) if names is None else names
     return tuple(name for name in names if is_whole(product_path(folder, name), stamp))
+
+
+def write_reasons(folder: Path, experiment: Experiment, names: Iterable[str], failed: Mapping[str, str]) -> None:
+    """Write why CCDs of a part of a run cannot be modelled, for the other parts; `names` are all CCDs of the part."""
+    for name in names:
+        if name in failed:
+            write_json(_reason_path(folder, name), {**stamp_of(experiment).meta(), "not_modelled": failed[name]})
+        else:
+            _reason_path(folder, name).unlink(missing_ok=True)
+
+
+def read_reasons(folder: Path, experiment: Experiment, names: Iterable[str]) -> dict[str, str]:
+    """Return why CCDs cannot be modelled, as far as other parts of this configuration have written it."""
+    reasons = {}
+    for name in names:
+        with suppress(OSError, ValueError, TypeError, KeyError):
+            content = json.loads(_reason_path(folder, name).read_text())
+            reason = str(content.pop("not_modelled"))
+            if content == stamp_of(experiment).meta():
+                reasons[name] = reason
+    return reasons
+
+
+def _reason_path(folder: Path, ccd: str) -> Path:
+    return folder / f"not_modelled_{ccd}.json"
 
 
 def stamp_of(experiment: Experiment) -> Stamp:

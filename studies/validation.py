@@ -36,6 +36,7 @@ from ..models.parameters.degrees_of_freedom_file import DegreesOfFreedomFile, lo
 from ..pipeline.config import Configuration, load_configuration, with_run
 from ..pipeline.experiment import Experiment
 from .alignment.config import AlignConfig, load_align_configuration
+from .night.config import NightConfig, load_night_configuration
 from .sweep.file import SweepFile, load_sweep
 from .tolerance.file import ToleranceFile, load_tolerances
 from .visits.config import VisitsConfig, load_visits_configuration
@@ -70,6 +71,7 @@ SchemaKind = Literal[
     "sweep",
     "images",
     "visits",
+    "night",
     "align",
     "site",
     "coatings",
@@ -80,6 +82,8 @@ SchemaKind = Literal[
 ]
 #: Chosen by what stands under its keys: runs name CCDs too.
 CAMERA = FileKind("camera", CameraFile, read_camera, PrescriptionError)
+#: Chosen by the list under its visits: stacks have visits too.
+NIGHT = FileKind("night", NightConfig, load_night_configuration, prepare=with_run)
 #: In the order in which the others are chosen where a file could be of two kinds.
 KINDS = (
     FileKind("prescription", Prescription, load_telescope, PrescriptionError),
@@ -87,6 +91,7 @@ KINDS = (
     FileKind("sweep", SweepFile, load_sweep),
     FileKind("images", ImagesConfig, load_images_configuration, prepare=with_run),
     FileKind("visits", VisitsConfig, load_visits_configuration, prepare=with_run),
+    NIGHT,
     FileKind("align", AlignConfig, load_align_configuration),
     FileKind("site", SiteFile, load_site, PrescriptionError),
     FileKind("coatings", CoatingsFile, Coatings.read),
@@ -132,9 +137,9 @@ class Validation:
 def validate_file(path: str | os.PathLike[str]) -> Validation:
     """Find all problems of a file.
 
-    Prescriptions (YAML, Zemax, CODE V), run configurations, sweeps, configurations of images, visits and alignment,
-    sites, coatings, tolerances, optimisations, degrees of freedom, cameras, and tables of CCD heights; which of them it
-    is, its ending and its keys tell.
+    Prescriptions (YAML, Zemax, CODE V), run configurations, sweeps, configurations of images, visits, nights and
+    alignment, sites, coatings, tolerances, optimisations, degrees of freedom, cameras, and tables of CCD heights; which
+    of them it is, its ending and its keys tell.
     Values that contradict one another are reported once everything else is in order.
 
     Parameters
@@ -165,7 +170,7 @@ def file_schema(kind: SchemaKind) -> dict[str, Any]:
     Parameters
     ----------
     kind : str
-        "prescription", "run", "sweep", "images", "visits", "align", "site", "coatings", "tolerances",
+        "prescription", "run", "sweep", "images", "visits", "night", "align", "site", "coatings", "tolerances",
         "optimization", "degrees_of_freedom" or "camera".
 
     Raises
@@ -193,6 +198,9 @@ def _yaml_file(path: Path) -> Validation:
 
 def _kind_by_keys(content: dict[str, Any], path: Path) -> FileKind:
     """Return the kind with most of the keys; where two have as many, the one with fewer others."""
+    visits = content.get("visits")
+    if isinstance(visits, dict) and "list" in visits:
+        return NIGHT
     kind = max((k for k in KINDS if k is not CAMERA), key=lambda k: (len(set(content) & _keys(k)), -len(_keys(k))))
     if not set(content) & _keys(kind):
         raise ConfigError(f"none of the keys of a {', '.join(k.name for k in KINDS)} is in it", file=path)

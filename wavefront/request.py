@@ -204,6 +204,11 @@ class Request:
         if self.focal_plane is not None:
             raise ConfigError(f"focal_plane: expected none for {purpose}, on the nominal detector", key="focal_plane")
 
+    def require_one_field(self) -> None:
+        """Refuse several fields for what is of one alone."""
+        if len(self.fields) != 1:
+            raise DomainError(f"field: {len(self.fields)} fields are given; expected one")
+
     def at_fields(self, fields: np.ndarray | slice) -> Request:
         """Return the request for a part of its fields, or for other field angles [rad], without vignetting factors."""
         if not isinstance(fields, slice):

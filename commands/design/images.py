@@ -77,7 +77,7 @@ def psf(
         cards = [
             ("MODEL", result.telescope, "telescope"),
             ("METHOD", result.method, "fft or huygens"),
-            ("PIXEL", result.pixel * 1e6, "[um] distance of pixel centres"),
+            ("PIXEL", result.pixel * 1e6, f"[{result.image_unit('um')}] distance of pixel centres"),
         ]
         write_fits(out, [image_hdu("PSF", result.image, "part of the light in each pixel")], None, cards)
     return result

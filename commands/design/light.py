@@ -61,9 +61,7 @@ def throughput(shared: SharedOptions, coatings: _Coatings = None) -> Outcome:
 
 
 def _throughput_rows(result: Throughput) -> Rows:
-    from ...design.drawing import field_text
-
-    headings = ("wavelength [nm]", *(field_text(f) for f in result.fields))
+    headings = ("wavelength [nm]", *result.field_labels())
     rows = [
         (f"{w * 1e9:.6g}", *(f"{100 * v:.3f}" for v in column))
         for w, column in zip(result.wavelengths, result.value.T, strict=True)

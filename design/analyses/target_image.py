@@ -178,7 +178,8 @@ def target_image(
     Raises
     ------
     DomainError
-        If the target is not an image with light, a number is out of range, or no light or parallel light arrives.
+        If the target is not an image with light, a number is out of range, several fields are given, or no light or
+        parallel light arrives.
     """
     picture = bar_target() if target is None else pure_numbers(target, "target")
     if picture.ndim != 2 or max(picture.shape) > _MOST_PIXELS or not (np.isfinite(picture).all() and picture.size):
@@ -200,6 +201,7 @@ def target_image(
         threads=threads,
     )
     request.require_nominal_detector("images of targets")
+    request.require_one_field()
     telescope = request.telescope
     principal = principal_rays_of(request)
     require_focus(telescope, principal.mean_f_number, principal.mean_plate_scale)
@@ -227,6 +229,7 @@ def target_image(
 def _landings(request: Request, picture: np.ndarray, step: float) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
     """Yield weight of a wavelength, landing points [n, 2] of lit rays and their light, some pixels at a time."""
     telescope, count = request.telescope, len(request.pupil)
+    points = request.vignetted(request.pupil.points).reshape(count, 2)
     row, column = np.nonzero(picture)
     middle = 0.5 * (np.array(picture.shape) - 1)
     offset = np.stack([column - middle[1], row - middle[0]], axis=-1)
@@ -238,7 +241,7 @@ def _landings(request: Request, picture: np.ndarray, step: float) -> Iterator[tu
         angles = request.fields[0] + step * (offset[batch, None] + within)
         telescope.check_field(angles[..., 0], angles[..., 1])
         directions = field_direction(angles[..., 0].ravel(), angles[..., 1].ravel(), request.projection)
-        pupil = np.tile(request.pupil.points, (len(angles), 1))[:, None]
+        pupil = np.tile(points, (len(angles), 1))[:, None]
         light = np.repeat(picture[row[batch], column[batch]] / count, count)
         for wavelength, weight in zip(request.wavelengths, request.weights, strict=True):
             rays = launch_bundles(telescope, directions, float(wavelength), pupil)

@@ -192,7 +192,7 @@ def efficiencies(request: Request, coatings: Coatings, wavelength: float) -> tup
     """Return which rays are lit [n_field, n_pupil], and the efficiency of each step for them by its name, else 0."""
     telescope = request.telescope
     rays = request.launch(wavelength)
-    results = trace(telescope, rays, "all", threads=request.threads)
+    results = trace(telescope, rays, "all", focal_plane=request.focal_plane, threads=request.threads)
     index = refractive_indices(telescope, wavelength)
     lit = (results[-1].status == RayStatus.OK).reshape(len(request.fields), -1)
     steps: dict[str, np.ndarray] = {}

@@ -45,6 +45,8 @@ _MOST = 3
 _FEWEST = 256
 #: Largest default number of lattice points across the pupil.
 _MOST_ACROSS = 2048
+#: Rays that are summed at a time, which bounds the memory.
+_RAYS = 4096
 
 
 @dataclass(frozen=True)
@@ -219,8 +221,7 @@ def mtf(
         directions = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         offset = np.where(diagram.weight[i][..., None] > 0, diagram.displacement[i], 0.0) @ directions.T
         for axis in (0, 1):
-            phase = np.exp(-2j * np.pi * np.multiply.outer(frequency, offset[..., axis].ravel()))
-            rays[axis, i] = phase @ diagram.weight[i].ravel()
+            rays[axis, i] = _transfer_of_rays(frequency, offset[..., axis].ravel(), diagram.weight[i].ravel())
     contrast, limit, geometric = (np.abs(v) / np.abs(v[..., :1]) for v in (transfer, perfect, rays))
     return Mtf(
         request=request,
@@ -239,9 +240,19 @@ def mtf(
 
 def tangential_angle(telescope: Telescope, principal: PrincipalRays) -> np.ndarray:
     """Return the angle from the x axis of the detector to the tangential direction [rad], shape [n_field]."""
-    ends = telescope.surfaces[-1].along(principal.marginal_direction)
-    across = ends[:, 0, :2] - ends[:, 1, :2]
+    # An ideal lens takes parallel light from places on it to directions opposite to them.
+    ends = -principal.marginal_position if telescope.design_data.afocal else principal.marginal_direction
+    across = telescope.surfaces[-1].along(ends[:, 0] - ends[:, 1])
     return np.arctan2(across[:, 1], across[:, 0])
+
+
+def _transfer_of_rays(frequency: np.ndarray, place: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """Return the transform of light at places [m] at frequencies [cycles/m]."""
+    total = np.zeros(len(frequency), dtype=np.complex128)
+    for first in range(0, len(place), _RAYS):
+        batch = slice(first, first + _RAYS)
+        total += np.exp(-2j * np.pi * np.multiply.outer(frequency, place[batch])) @ light[batch]
+    return total
 
 
 def _overlap(pupil: np.ndarray, count: int) -> np.ndarray:

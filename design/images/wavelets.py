@@ -92,18 +92,19 @@ def traced_wavelets(request: Request, wavelength: float, center: np.ndarray) -> 
     step = _STEP * 0.5 * telescope.pupil_diameter
     beside = (points, points + np.array([step, 0.0]), points + np.array([0.0, step]))
     bundle = request.bundles(wavelength, np.concatenate(beside))
-    opd, cosine = _at_reference(telescope, bundle, center)
+    opd, cosine = _at_reference(request, bundle, center)
     central, along_x, along_y = cosine.reshape(3, -1, 2)
     (xx, xy), (yx, yy) = (along_x - central).T, (along_y - central).T
     jacobian = np.abs(xx * yy - xy * yx) / step**2
     lit = bundle.lit[0, : len(points)] & np.isfinite(jacobian)
     annulus = 0.25 * np.pi * telescope.pupil_diameter**2 * (1.0 - telescope.pupil_obscuration**2)
-    amplitude = np.where(lit, weights * np.sqrt(annulus * jacobian), 0.0)
+    area = float(request.pupil_areas[0])
+    amplitude = np.where(lit, weights * np.sqrt(area * annulus * jacobian), 0.0)
     return Wavelets(
         cosine=np.where(lit[:, None], central, 0.0),
         opd=np.where(lit, opd[: len(points)], 0.0),
         amplitude=amplitude,
-        lit_fraction=float(weights[lit].sum()),
+        lit_fraction=area * float(weights[lit].sum()),
         wavelength=wavelength,
     )
 
@@ -126,7 +127,7 @@ def lattice_wavelets(
     # Points of the plane of the entrance pupil: where rays are aimed, the stop has to be traced to, not to be hit.
     def rays(points: np.ndarray) -> tuple[Bundles, np.ndarray, np.ndarray]:
         bundle = request.bundles(wavelength, entrance=points)
-        opd, cosine = _at_reference(telescope, bundle, center)
+        opd, cosine = _at_reference(request, bundle, center)
         return bundle, opd, cosine if straight else cosine @ rotation
 
     def lit_rays(bundle: Bundles, points: np.ndarray) -> np.ndarray:
@@ -166,13 +167,14 @@ def lattice_wavelets(
     cover = _coverage(lambda finer: lit_rays(rays(finer)[0], finer), points, jacobian, lit, near, n, spacing)
     cell = np.abs(np.linalg.det(by_cosine)) * spacing**2
     annulus = np.pi * radius**2 * (1.0 - telescope.pupil_obscuration**2)
-    energy = np.where(np.isfinite(opd), cell / annulus, 0.0)
+    area = float(request.pupil_areas[0])
+    energy = np.where(np.isfinite(opd), area * cell / annulus, 0.0)
     amplitude, path = np.zeros((2, n * n))
     amplitude[near] = cover * np.sqrt(energy) * spacing
     path[near] = np.where(np.isfinite(opd), opd, 0.0)
     grid = np.stack(np.meshgrid(steps, steps), axis=-1) @ rotation.T
     # The lit fractions of cells on the rim are uncertain by a few per cent each; their sum may exceed the whole.
-    lit_fraction = min(float((cover * energy).sum()), 1.0)
+    lit_fraction = min(float((cover * energy).sum()), area)
     wavelets = Wavelets(grid, path.reshape(n, n), amplitude.reshape(n, n), lit_fraction, wavelength)
     return WaveletLattice(wavelets, steps, spacing)
 
@@ -280,14 +282,15 @@ def _coverage(
     return cover
 
 
-def _at_reference(telescope: Telescope, bundle: Bundles, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _at_reference(request: Request, bundle: Bundles, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return path differences [m] at a point of the detector, shape [n], and cosines along it there, shape [n, 2]."""
     if bundle.afocal:
         return _far_away(bundle, center)
-    shape = telescope.surfaces[-1].shape
-    point = np.array([*center, float(shape.sag(*center))])
-    slopes = np.array([float(v) for v in shape.gradient(*center)])
-    n = bundle.index
+    shape, plane = request.telescope.surfaces[-1].shape, request.focal_plane
+    height, slopes = shape.sag(*center), np.array(shape.gradient(*center), dtype=np.float64)
+    if plane is not None and plane.ccd_at(*center) >= 0:
+        height, slopes = plane.height(*center), plane.gradient(*center)
+    point, n = np.array([*center, float(height)]), bundle.index
 
     def path(length: np.ndarray, position: np.ndarray, direction: np.ndarray) -> np.ndarray:
         return length + n * np.einsum("...i,...i", point - position, direction)

@@ -268,7 +268,8 @@ def ghosts(
     UnknownNameError
         If a reflectivity or coating is given for a surface that does not exist.
     DomainError
-        If a number is out of range, no surface can make a ghost, or the star itself does not reach the detector.
+        If a number is out of range, several fields are given, no surface can make a ghost, or the star itself does not
+        reach the detector.
     """
     n_pupil = require_count(n_pupil, "n_pupil", _LEAST_RAYS, _MOST_RAYS)
     brightest = None if brightest is None else require_count(brightest, "brightest", 1)
@@ -284,6 +285,7 @@ def ghosts(
         one_wavelength=True,
         default_fields=lambda telescope: [0.0, _FIELD * telescope.field_radius],
     )
+    request.require_one_field()
     telescope, threads = request.telescope, request.threads
     require_image(telescope, "a map of ghosts")
     reflecting = reflectivity if isinstance(reflectivity, Reflectivity) else Reflectivity(reflectivity)

@@ -229,10 +229,11 @@ def spot_diagram(request: Request, reference: SpotReference = "centroid") -> Spo
     principal = principal_rays_of(request)
     chief = bundles[request.middle_index].chief_landing()
     lit = np.stack([b.lit for b in bundles], axis=1)
+    light = request.pupil_areas[:, None, None] * (request.weights[:, None] * request.pupil.weights)
     diagram = SpotDiagram(
         request=request,
         displacement=np.stack([b.landing() for b in bundles], axis=1) - chief[:, None, None],
-        weight=np.where(lit, request.weights[:, None] * request.pupil.weights, 0.0),
+        weight=np.where(lit, light, 0.0),
         reference_point=chief,
         plate_scale=principal.mean_plate_scale,
         airy_radius=1.22 * request.middle * np.where(np.isinf(ratio := principal.mean_f_number), np.nan, ratio),

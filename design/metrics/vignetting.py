@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -129,10 +129,12 @@ def vignetting(
     )
     telescope = request.telescope
     with_axis = request.at_fields(np.concatenate([np.zeros((1, 2)), request.fields]))
+    if request.vignetting is not None:
+        with_axis = replace(with_axis, vignetting=np.pad(request.vignetting, ((1, 0), (0, 0))))
     quarters = np.empty((len(with_axis.fields), 4))
     for rows, batch in with_axis.parts():
         lit = batch.bundles(request.wavelength).lit
-        quarters[rows] = lit.reshape(len(lit), -1, 4).mean(axis=1)
+        quarters[rows] = batch.pupil_areas[:, None] * lit.reshape(len(lit), -1, 4).mean(axis=1)
         if progress is not None:
             progress(len(lit))
     fraction = quarters.mean(axis=1)

@@ -9,14 +9,17 @@ import numpy as np
 
 from ...core.errors import PachonError
 from ...models.telescope import Telescope
+from ...raytrace.rays import field_angles
+from ..images.mtf import tangential_angle
+from ..metrics.principal_rays import principal_rays_of
 from ..metrics.spots import spot_diagram
 from ..optimize.merit import Beams, Merit, SpotMerit, WavefrontMerit
 from ..optimize.ray_operands import WavefrontMtf
 
 #: Fraction of the rays within the radius of the criterion "ee80".
 _ENERGY = 0.8
-#: Directions of the modulation transfer: along the field, and across it [rad].
-_DIRECTIONS = (0.5 * np.pi, 0.0)
+#: Directions of the modulation transfer: along the field, and across it, from the former [rad].
+_DIRECTIONS = np.array([0.0, 0.5 * np.pi])
 _RMS_OVER_RAYS = "rms over fields, wavelengths and pupil"
 
 
@@ -123,11 +126,12 @@ class _MeanTransfer:
     @classmethod
     def of(cls, telescope: Telescope, beams: Beams, frequency: float) -> _MeanTransfer:
         request = beams.request
+        along_field = tangential_angle(telescope, principal_rays_of(replace(request, telescope=telescope)))
         operands = tuple(
-            WavefrontMtf((float(x), float(y)), frequency, angle, float(wavelength), value=1.0).bound(telescope)
-            for x, y in request.fields
+            WavefrontMtf((float(x), float(y)), frequency, float(angle), float(wavelength), value=1.0).bound(telescope)
+            for (x, y), tangential in zip(field_angles(request.slopes), along_field, strict=True)
             for wavelength in request.wavelengths
-            for angle in _DIRECTIONS
+            for angle in tangential + _DIRECTIONS
         )
         weights = np.outer(beams.field_weights, request.weights).ravel()
         return cls(operands, np.repeat(weights, len(_DIRECTIONS)) / len(_DIRECTIONS))

@@ -211,22 +211,35 @@ def shear_bias(
         # Under a negative shear the other one of the pair is under the positive one.
         positive = (g > 0.0)[:, None]
         upper, lower = np.where(positive, plus_sums, minus_sums), np.where(positive, minus_sums, plus_sums)
-        size = float(np.abs(g[rows]).mean()) if rows.any() else np.nan
-        response, error = _pair_shears(upper[rows], lower[rows], k, -1.0)
-        estimates.append((response / size - 1.0, error / size, *_pair_shears(plus_sums, minus_sums, k, 1.0)))
+        response, error = _pair_shears(upper[rows], lower[rows], k, -1.0, np.abs(g[rows]))
+        estimates.append((response - 1.0, error, *_pair_shears(plus_sums, minus_sums, k, 1.0, np.ones(count))))
     m, m_error, c, c_error = np.array(estimates).T
     return ShearBias(m, m_error, c, c_error)
 
 
-def _pair_shears(plus: np.ndarray, minus: np.ndarray, component: int, sign: float) -> tuple[float, float]:
-    """Return half the sum or difference of the shears of two sums by patch [p, 5], and its jackknife error."""
+def _pair_shears(
+    plus: np.ndarray, minus: np.ndarray, component: int, sign: float, unit: np.ndarray
+) -> tuple[float, float]:
+    """Return half the sum or difference of the shears of two sums by patch [p, 5], and its jackknife error.
+
+    They are in units of `unit` of each patch [p], whose means count patches by their responses as the shears do.
+    """
     if not len(plus):
         return float("nan"), float("nan")
-    total, without_patch = (
-        0.5 * (shear_of_sums(a)[..., component] + sign * shear_of_sums(b)[..., component])
-        for a, b in ((plus.sum(axis=0), minus.sum(axis=0)), (plus.sum(axis=0) - plus, minus.sum(axis=0) - minus))
+    of_units = [side[:, 2 + 2 * component] * unit for side in (plus, minus)]
+
+    def ratio(sums: Sequence[np.ndarray], unit_sums: Sequence[np.ndarray]) -> np.ndarray:
+        first, second = (shear_of_sums(side)[..., component] for side in sums)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            units = [of_side / side[..., 2 + 2 * component] for of_side, side in zip(unit_sums, sums, strict=True)]
+            return np.asarray((first + sign * second) / (units[0] + units[1]))
+
+    totals, unit_totals = [plus.sum(axis=0), minus.sum(axis=0)], [values.sum() for values in of_units]
+    without_patch = ratio(
+        [total - side for total, side in zip(totals, (plus, minus), strict=True)],
+        [total - values for total, values in zip(unit_totals, of_units, strict=True)],
     )
-    return float(total), float(jackknife_error(without_patch))
+    return float(ratio(totals, unit_totals)), float(jackknife_error(without_patch))
 
 
 def shear_of_sums(sums: np.ndarray) -> np.ndarray:

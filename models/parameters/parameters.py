@@ -347,7 +347,8 @@ def _media(telescope: Telescope) -> set[str]:
 def index_surfaces(telescope: Telescope, target: str) -> list[int]:
     """Return the indices of the surfaces with the medium of an index parameter behind them.
 
-    One refracting surface, and those after it up to the next that refracts; for a medium, all such runs.
+    One refracting surface, and those after it up to the next that refracts, or a thin lens with another medium behind
+    it; for a medium, all such runs.
     """
     indices: list[int] = []
     inside = False
@@ -355,6 +356,8 @@ def index_surfaces(telescope: Telescope, target: str) -> list[int]:
         if surface.interaction == Interaction.REFRACT:
             name = surface.name if target in telescope.surface_names else surface.medium_after.name
             inside = name == target
+        elif surface.interaction == Interaction.THIN_LENS and inside:
+            inside = surface.medium_after == telescope.surfaces[i - 1].medium_after
         if inside:
             indices.append(i)
     return indices

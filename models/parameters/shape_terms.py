@@ -72,7 +72,7 @@ def term_unit(shape: Shape, name: str) -> str:
     if isinstance(shape, Sum):
         component, inner = shape.place(name)
         return term_unit(component, inner)
-    powers = [int(n) for n in re.findall(r"\d+", name)] if re.fullmatch(r"a\d+|x\d+y\d+", name) else []
+    powers = [int(n) for n in re.findall(r"\d+", name)] if re.fullmatch(r"[ay]\d+|x\d+y\d+", name) else []
     if powers:
         return {0: "", 1: "m"}.get(1 - sum(powers), f"m^{1 - sum(powers)}")
     return {"conic": "", "curvature": "1/m"}.get(name.partition("_")[0], "m")

@@ -21,9 +21,10 @@ def thermal(
 ) -> DegreeOfFreedom:
     """Return temperature as a degree of freedom, in K.
 
-    A shape parameter in m^p changes by p times the expansion; a surface moves away from the origin, the vertex of the
-    primary, as if held by a structure that expands like the surface. Rims of apertures, nodes of grids and outer radii
-    of Zernike terms stay, as they do not affect rays. A telescope of one material keeps its shape and grows.
+    A shape parameter in m^p changes by p times the expansion, a grating's lines per length by minus it; a surface moves
+    away from the origin, the vertex of the primary, as if held by a structure that expands like the surface. Rims of
+    apertures, nodes of grids and outer radii of Zernike terms stay. A telescope of one material keeps its shape and
+    grows.
 
     Parameters
     ----------
@@ -59,6 +60,8 @@ def thermal(
         for term, value in surface.shape.parameters.items():
             if not re.search(r"node\[|curvature", term) and np.isfinite(value):
                 of[f"{name}.{term}"] = rate * _power(term_unit(surface.shape, term)) * value
+        if surface.grating is not None:
+            of[f"{name}.lines_per_mm"] = -rate * surface.grating.lines_per_mm
     for name, rate in (dn_dt or {}).items():
         if telescope.surface(name).interaction != Interaction.REFRACT or not np.isfinite(rate):
             raise DomainError(f"dn_dt of {name} = {rate!r}: expected a number per K, behind a refracting surface")

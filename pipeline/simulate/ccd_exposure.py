@@ -16,7 +16,7 @@ from ...models.ideal_telescope import ideal_telescope
 from ...models.star_spectrum import blackbody_photons
 from ...wavefront.chief_rays import fields_of_groups
 from ...wavefront.psf.engine import center_focal_length
-from ...wavefront.psf.engines import psf_engine
+from ...wavefront.psf.engines import ENGINES, psf_engine
 from ...wavefront.psf.light import Light
 from ...wavefront.psf.psf import make_psfs
 from ...wavefront.psf.stamps import Stamps
@@ -204,7 +204,9 @@ def _expose_twice(
         recenter=kept_centroid,
         temperatures=temperatures,
     )
-    images = _with_static_displacements(experiment, positions - offsets * experiment.pixel_size, np.concatenate(first))
+    drawn_first = np.concatenate(first)
+    drawn_first[ENGINES[experiment.config.psf.engine].order(moved.fields)] = drawn_first.copy()
+    images = _with_static_displacements(experiment, positions - offsets * experiment.pixel_size, drawn_first)
     rim = _SHIFT_ROOM // 2
     inner = moved.image[:, rim:-rim, rim:-rim]
     light = inner.sum(axis=(1, 2), keepdims=True, dtype=np.float64)
@@ -235,7 +237,7 @@ def _centroids(experiment: Experiment, images: np.ndarray, pixel_scale: float) -
 
 def _require_light(stars: NoiseFreeStars) -> NoiseFreeStars:
     """Return the stars, or raise a DomainError if no light reaches one of them."""
-    if not stars.lit_fraction.min() > 0.0:
+    if not (stars.lit_fraction > 0.0).all():
         raise DomainError("no light reaches some stars: expected a CCD within the field of the telescope")
     return stars
 

@@ -166,7 +166,8 @@ def _exposed(experiment: Experiment, exposure: CcdExposure) -> _ExposedCcd:
     holdout, observed = exposure.holdout, exposure.observed
     # Positions do not depend on the magnitude limits, which follow from the vignetting of the stars.
     width = effective_fwhm(holdout.image, holdout.pixel_scale)
-    stars = ccd_stars(experiment, exposure.name, width, least_light=float(observed.lit_fraction.min()))
+    least_light = float(observed.lit_fraction.min()) if len(observed.lit_fraction) else 1.0
+    stars = ccd_stars(experiment, exposure.name, width, least_light=least_light)
     electrons = stars.electrons * observed.lit_fraction
     dimmed = stars.magnitude - 2.5 * np.log10(observed.lit_fraction)
     snr = signal_to_noise(dimmed, stars.band, experiment.config.atmosphere.exposure_s, width)

@@ -192,6 +192,8 @@ def backward_loop(special: bool) -> wp.Function:
                     by_value = per_path
             by_grooves = lanes(ZERO)
             by_after = lanes(ZERO)
+            by_front = lanes(ZERO)
+            by_behind = lanes(ZERO)
             groove_x = ZERO
             groove_y = ZERO
             ruled = int(0)
@@ -243,7 +245,7 @@ def backward_loop(special: bool) -> wp.Function:
                 if interaction == THIN_LENS:
                     power = surfaces.numbers[s, POWER]
                     vergence = surfaces.numbers[s, VERGENCE]
-                    ex, ey, fx, fy, fz = thin_lens_adjoint(
+                    ex, ey, fx, fy, fz, by_front, by_behind = thin_lens_adjoint(
                         power, vergence, before, after, x, y, u, v, w, bx, by, bz, per_path
                     )
                     hx = hx + ex
@@ -280,6 +282,10 @@ def backward_loop(special: bool) -> wp.Function:
                 if ruled == 1:
                     by_mu = wp.where(interaction == MIRROR, ZERO, after / before) * by_after
             write_column(columns, s, INDEX + 1, o, p, (-before / (after * after)) * by_mu, matrix)
+            if wp.static(special):
+                if interaction == THIN_LENS:
+                    write_column(columns, s, INDEX, o, p, wp.cw_mul(per_path, t) + by_front, matrix)
+                    write_column(columns, s, INDEX + 1, o, p, by_behind, matrix)
 
             ax = ex
             ay = ey

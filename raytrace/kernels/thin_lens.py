@@ -82,7 +82,10 @@ def thin_lens_adjoint(
     bz: lanes,
     per_path: lanes,
 ):
-    """Return derivatives by the point (x, y) and by the direction in front, from those by direction and path."""
+    """Return derivatives by the point (x, y), direction in front and both indices, from those by direction and path.
+
+    Point and direction stay where the index in front changes.
+    """
     p, q, p1, q1 = lens_slopes(power, lanes(n), lanes(behind), x, y, u, v, w)
     k = vergence
     k1 = (power - n * vergence) / behind
@@ -105,6 +108,10 @@ def thin_lens_adjoint(
     gy = gy + wp.cw_mul(scale, TWO * y - wp.cw_mul(ratio, wp.cw_div(ay, far) + wp.cw_div(q1, length)))
     px = wp.cw_mul(scale, TWO * ax - k1 * wp.cw_mul(ratio, wp.cw_div(ax, far)))
     py = wp.cw_mul(scale, TWO * ay - k1 * wp.cw_mul(ratio, wp.cw_div(ay, far)))
+    # By k'; both k' and the slopes behind are quotients by n', of n k and n t.
+    by_k1 = wp.cw_mul(scale, square - wp.cw_mul(ratio, wp.cw_div(wp.cw_mul(ax, x) + wp.cw_mul(ay, y), far)))
+    by_front = (ONE / behind) * (wp.cw_mul(gx, p) + wp.cw_mul(gy, q) - k * by_k1)
+    by_behind = wp.cw_mul(per_path, ratio) - (ONE / behind) * (wp.cw_mul(gx, p1) + wp.cw_mul(gy, q1) + k1 * by_k1)
     # By the point through the slopes behind, and by the slopes in front.
     px = px - (power / behind) * gx
     py = py - (power / behind) * gy
@@ -121,6 +128,7 @@ def thin_lens_adjoint(
     hy = hy - wp.cw_mul(scale, TWO * y + wp.cw_mul(ratio, wp.cw_div(q, length) - wp.cw_div(ay, far)))
     px = px + wp.cw_mul(scale, TWO * ax - k * wp.cw_mul(ratio, wp.cw_div(ax, far)))
     py = py + wp.cw_mul(scale, TWO * ay - k * wp.cw_mul(ratio, wp.cw_div(ay, far)))
+    by_front = by_front + wp.cw_mul(per_path, ratio)
     # The slopes are (u, v) / |w|.
     depth = wp.cw_mul(side, w)
     return (
@@ -129,4 +137,6 @@ def thin_lens_adjoint(
         wp.cw_div(hx, depth),
         wp.cw_div(hy, depth),
         -wp.cw_div(wp.cw_mul(hx, p) + wp.cw_mul(hy, q), w),
+        by_front,
+        by_behind,
     )

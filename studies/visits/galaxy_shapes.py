@@ -100,6 +100,7 @@ def measure_galaxies(
     seed: int,
     *key: str | int,
     reach: float,
+    sigma: float | None = None,
     threads: int | None = None,
 ) -> GalaxyShapes:
     """Draw galaxies, each on a stamp of its own, and measure them twice.
@@ -118,6 +119,9 @@ def measure_galaxies(
         Random stream of the noise.
     reach : float
         Largest distance of galaxies from the nearest position with a known PSF [rad].
+    sigma : float, optional
+        rms width of the weight of the shear [rad]: parts of the sky with other ones have other responses. By default
+        wide enough for the PSFs of the stack.
     threads : int, optional
         Number of threads; all processors by default. No byte depends on it.
     """
@@ -135,7 +139,7 @@ def measure_galaxies(
     offset = pixels[near] - np.rint(pixels[near])
     block_fits: list[tuple[np.ndarray, GalaxyFits, GalaxyFits]] = []
     rng = stream(seed, *key)
-    sigma = weight_sigma(None, stack.true[places], exposure.pixel_scale)
+    sigma = weight_sigma(sigma, stack.true[places], exposure.pixel_scale)
     sides = stamp_sides(sigma / exposure.pixel_scale)
     shear_parts: list[tuple[np.ndarray, ShearShapes, ShearShapes]] = []
     for side, rows in zip(sides, (on_image <= _LARGE, on_image > _LARGE), strict=True):

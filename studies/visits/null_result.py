@@ -265,8 +265,7 @@ def amplitude(result: NullTest) -> float:
 def shot_noise(result: NullTest) -> float:
     """Return the mean absolute value of xi+ that unrelated ellipticities would have in the same bins.
 
-    The standard deviation of xi+ in a bin of N pairs is sqrt(2) sigma^2 / sqrt(2 N) = sigma^2 / sqrt(N), with the rms
-    sigma of a component.
+    The standard deviation of xi+ in a bin of N pairs is sqrt(2) sigma^2 / sqrt(N), with the rms sigma of a component.
     """
     galaxies, xi = result.galaxies, result.correlations["model"]
     square = 0.5 * float(np.mean(galaxies.e1[galaxies.usable] ** 2 + galaxies.e2[galaxies.usable] ** 2))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from ...imaging.galaxies import SkyGalaxies
 from ...measure.catalogue.shear_calibration import ShearCalibration
 from ...measure.shear.shear_shapes import ShearBias, ShearShapes
 from ...measure.shear.shear_shapes import shear_bias as functional_shear_bias
+from ...measure.shear.weight import weight_sigma
 from ...pipeline.run_folder import CONFIG_NAME
 from ...sky.galaxies import Galaxies
 from ...sky.mosaic import PlantedGalaxies
@@ -178,6 +180,11 @@ class _StackMeasurement:
     cell: float
     reach: float
 
+    @cached_property
+    def sigma(self) -> float:
+        """Rms width of the weight of the shear [rad], that of the whole stack on each of its tiles."""
+        return weight_sigma(None, self.stack.true[~self.stack.star], self.exposure.pixel_scale)
+
     def jobs(self, todo: list[tuple[int, int]], tiles: list[tuple[int, int]], rings: int) -> Iterator[dict[str, Any]]:
         """Yield the arguments of :func:`measure_galaxies` for tiles, and then for the rings of all tiles."""
         for tile in todo:
@@ -224,6 +231,7 @@ class _StackMeasurement:
             "seed": self.seed,
             "key": key,
             "reach": self.reach,
+            "sigma": self.sigma,
         }
 
 
@@ -237,6 +245,7 @@ def measure_job(job: dict[str, Any], threads: int) -> GalaxyShapes:
         job["seed"],
         *job["key"],
         reach=job["reach"],
+        sigma=job["sigma"],
         threads=threads,
     )
 

@@ -63,6 +63,8 @@ def test_objects_at_a_finite_distance_are_in_millimetres(in_folder, capsys):
     out = capsys.readouterr().out
     assert "object [mm]" in out
     assert "arcsec" not in out
+    assert main(["throughput", FINITE, "--picture", "picture.png"]) == 0
+    assert capsys.readouterr().out.count(" mm ") >= 3
 
 
 def test_aiming_is_checked(capsys, in_folder):

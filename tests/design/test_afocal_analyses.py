@@ -4,19 +4,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from scipy.special import j0, j1
 
 import pachon
+from pachon.commands.cli import main
 from pachon.core.errors import DomainError, PrescriptionError, PrescriptionWarning
+from pachon.design.images.mtf import tangential_angle
 from pachon.design.optimize.jacobian import ParameterColumns
 from pachon.design.optimize.merit import Beams, SpotMerit, WavefrontMerit
 from pachon.models.design_data import DesignData
 from pachon.models.first_order import first_order
+from pachon.models.io.prescription import save_telescope
 from pachon.models.media.medium import ConstantIndex
 from pachon.models.parameters.parameters import parse_parameters
 from pachon.models.shapes.shape import Conic, Plane
 from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM, Telescope
+from pachon.models.thin_lens import ThinLens
 from pachon.pipeline.config import configuration_of
 from pachon.pipeline.experiment import Experiment
 from pachon.studies.metrics.telescope import TELESCOPE_METRICS, TelescopeScene
@@ -298,3 +303,27 @@ def test_a_code_v_file_says_that_it_is_afocal(tmp_path, line, afocal):
         f"RDM\nDIM M\nEPD 20\nWL 550\n{line}\nYAN 0 1\nSO 0 1e11\nS 100 4 NBK7_SCHOTT\nS 0 50\nSI 0 0\nGO\n"
     )
     assert pachon.load_telescope(path).design_data.afocal == afocal
+
+
+def test_the_tangential_direction_of_transfer_is_that_of_the_field():
+    """Behind ideal lenses light is parallel: differences of the directions of marginal rays are rounding alone."""
+    air = ConstantIndex(1.0)
+    first, second = (
+        Surface(name, Interaction.THIN_LENS, Plane(), (0.0, 0.0, z), air, thin_lens=ThinLens(focal_length))
+        for name, z, focal_length in (("objective", 0.0, 0.5), ("eyepiece", -0.6, 0.1))
+    )
+    surfaces = (first, second, Surface("exit", Interaction.DETECTOR, Plane(), (0.0, 0.0, -0.7), air))
+    telescope, angle = replace(expander(), surfaces=surfaces), np.deg2rad([0.0, 30.0, 60.0, 135.0])
+    fields = 2e-3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    found = tangential_angle(telescope, pachon.design.principal_rays(telescope, fields))
+    assert np.sin(found - angle) == pytest.approx(np.zeros(4), abs=1e-5)
+
+
+def test_files_of_images_say_that_pixels_are_angles(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_telescope(expander(), "expander.yaml")
+    assert (
+        main(["psf", "expander.yaml", "--field-deg", "0", "--pixels", "16", "--pupil-points", "32", "-o", "p.fits"])
+        == 0
+    )
+    assert fits.getheader("p.fits").comments["PIXEL"] == "[urad] distance of pixel centres"

@@ -230,6 +230,8 @@ def test_a_deeper_exposure_of_a_scene_has_more_of_everything(small_run, stars):
     unclipped = plain.mask == 0
     assert np.allclose(deep.image[unclipped], 100.0 * plain.image[unclipped], rtol=1e-5, atol=1e-2)
     assert np.allclose(deep.objects["FLUX"], 100.0 * plain.objects["FLUX"], rtol=1e-12)
+    # The middle of the exposure is that of all of its time.
+    assert [scene.header["DATE-AVG"][-12:] for scene in (plain, deep)] == ["12:00:01.000", "12:01:40.000"]
 
 
 def test_light_beyond_the_grids_is_below_the_noise_of_the_deep_cutout(small_run):

@@ -108,6 +108,53 @@ def test_shot_noise_error():
     assert scatter / claimed == pytest.approx(1.0, abs=0.2)  # 200 fields: 5 % each, four sigma
 
 
+def test_shot_noise_error_of_two_ellipticities_of_the_same_stars():
+    """Equal ones have the error of one; of others the scatter over many fields is what the error bar claims."""
+    bins = SeparationBins(10 * ARCMIN, 60 * ARCMIN, 1)
+    x, y, e1, e2 = catalogue(100)
+    weight = np.random.default_rng(9).uniform(0.5, 1.5, 100)
+    for weights in (None, weight):
+        one = shear_correlation(x, y, e1, e2, bins=bins, weight=weights)
+        both = shear_correlation(x, y, e1, e2, other=(e1, e2), bins=bins, weight=weights)
+        assert both.error_plus == pytest.approx(one.error_plus, rel=1e-6)
+        assert both.error_minus == pytest.approx(one.error_minus, rel=1e-6)
+    results = []
+    for seed in range(400):
+        rng = np.random.default_rng(seed)
+        x, y = rng.uniform(0.0, 60 * ARCMIN, (2, 60))
+        e, noise = rng.normal(0.0, 0.02, (2, 2, 60))
+        # A correlation of i: f lies at 45 degrees to e, and xi+ has a smaller error than of unrelated ones.
+        f = np.stack([-e[1], e[0]]) + 0.3 * noise
+        results.append(shear_correlation(x, y, *e, other=f, bins=bins))
+    for sign in ("plus", "minus"):
+        scatter = np.std([getattr(c, f"xi_{sign}")[0] for c in results])
+        claimed = np.mean([getattr(c, f"error_{sign}")[0] for c in results])
+        assert scatter / claimed == pytest.approx(1.0, abs=0.15), sign  # 400 fields: 3.5 % each, four sigma
+
+
+def test_stars_without_weight_are_left_out():
+    x, y, e1, e2 = catalogue(60)
+    weight = np.where(np.arange(60) < 20, 0.0, 1.0)
+    patch = np.arange(60) // 20
+    some = shear_correlation(x[20:], y[20:], e1[20:], e2[20:], bins=BINS, patch=patch[20:])
+    whole = shear_correlation(x, y, e1, e2, bins=BINS, weight=weight, patch=patch)
+    assert (whole.n_stars, whole.n_patches) == (40, 2)
+    np.testing.assert_array_equal(whole.n_pairs, some.n_pairs)
+    np.testing.assert_allclose(whole.error_plus, some.error_plus, rtol=1e-6)
+    with pytest.raises(DomainError, match="0 of 60 stars are usable, expected at least 2"):
+        shear_correlation(x, y, e1, e2, bins=BINS, weight=np.zeros(60), subtract_mean=True)
+
+
+def test_means_over_ranges_count_pairs_by_their_weights():
+    """The mean over bins is xi+ of one bin as wide as all of them, jackknife included."""
+    x, y, e1, e2 = catalogue(80)
+    options = {"weight": np.random.default_rng(10).uniform(0.0, 1.0, 80) ** 4, "patch": np.arange(80) // 16}
+    many = shear_correlation(x, y, e1, e2, bins=SeparationBins(1.0 * ARCMIN, 9.0 * ARCMIN, 6), **options)
+    one = shear_correlation(x, y, e1, e2, bins=SeparationBins(1.0 * ARCMIN, 9.0 * ARCMIN, 1), **options)
+    assert many.mean_xi_plus("short") == pytest.approx(one.xi_plus[0], rel=1e-6)
+    assert many.error_mean_xi_plus("short") == pytest.approx(one.error_plus[0], rel=1e-5)
+
+
 def test_cells_agree_with_pairs():
     x, y, e1, e2 = catalogue(3000)
     pairs = shear_correlation(x, y, e1, e2, bins=BINS)

@@ -249,3 +249,18 @@ def test_steps_from_near_the_centroid_end_where_others_do():
         assert getattr(other, name) == pytest.approx(getattr(one, name), abs=1e-10)
     with pytest.raises(DomainError, match=r"centers have shape \(2,\): expected \(6, 2\)"):
         measure_shapes(images, PIXEL, WEIGHT, centers=np.zeros(2))
+
+
+def test_a_masked_image_beside_others_moves_none_of_their_starts():
+    """Two stars on a stamp: which of them is measured depends on the start, and on no other image of the batch."""
+    stamp = gaussian(41, np.eye(2) * 3.0, (-9.0, 0.0)) + gaussian(41, np.eye(2) * 3.0, (9.0, 0.0))
+    masked = gaussian()
+    masked[20, 20] = np.nan
+    starts = np.array([[8.0, 0.0], [3.0, 3.0]])
+    alone, whole = (
+        measure_shapes(i, PIXEL, WEIGHT, centers=s) for i, s in ((stamp, starts[:1]), ([stamp, masked], starts))
+    )
+    assert alone.x[0] == pytest.approx(9.0, abs=0.01)
+    for name in ("x", "y", "e1", "e2", "size"):
+        assert getattr(whole, name)[:1].tobytes() == getattr(alone, name).tobytes(), name
+    assert whole.e1[1:].tobytes() == measure_shapes(masked, PIXEL, WEIGHT).e1.tobytes()

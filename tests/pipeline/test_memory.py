@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from pachon.pipeline import run as run_module
 from pachon.pipeline.config import Configuration, with_options
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.memory import check_memory, needed_bytes
+from pachon.pipeline.star_list import StarList
 
 GB = 1_000_000_000
 
@@ -41,6 +43,14 @@ def test_screens_are_most_of_what_is_needed():
     # A stamp of 31 x 31 pixels in single precision, at least.
     more = needed_bytes(experiment(stars__truth=1_000_000, atmosphere__enabled=False))
     assert more > 1_000_000 * 61 * 61 * 4
+
+
+def test_models_of_single_pixels_store_each_star_of_a_catalogue():
+    drawn = Experiment.from_config(with_options(Configuration(), ccds=("R22", "R32"), atmosphere__enabled=False))
+    stars = {name: np.zeros((3000, 3)) for name in drawn.config.ccds}
+    listed = replace(drawn, star_list=StarList("stars.csv", stars, {}))
+    # The stamp of a star and its weight in kriging, both in double precision.
+    assert needed_bytes(listed) > 18 * 3000 * 16 * drawn.stamp_size**2
 
 
 def test_what_does_not_fit_names_the_key_and_what_would(monkeypatch):

@@ -237,3 +237,14 @@ def test_a_focal_plane_model_of_rotated_ccds(tmp_path):
     product = read_product(tmp_path / "out" / "ccd_B.fits", stamp_of(experiment))
     again = model.shapes("B", product.holdout.x, product.holdout.y)
     np.testing.assert_allclose(again.e1, product.holdout.model_e1, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("pixel", [15.0, 2.0, 0.3])
+def test_photometry_has_the_angle_of_small_pixels(tmp_path, pixel):
+    """To three digits: a thousandth of an arcsec is a third of pixels of 3 mas, and the sky goes as the square."""
+    ccd = "{name: A, x_mm: 0, y_mm: 0, pixels: [1000, 1000]}"
+    (tmp_path / "fine.yaml").write_text(f"name: fine\nsource: test\npixel_um: {pixel}\nccds:\n  - {ccd}\n")
+    experiment = small(tmp_path, camera="fine.yaml", psf={"n_pupil": 60, "stamp": 25, "pixel_um": 15})
+    # The angle of a millimetre in the middle of the field.
+    angle = np.hypot(*pachon.fields_at(experiment.telescope, [[1e-3, 0.0]])[0])
+    assert experiment.band.pixel_scale == pytest.approx(angle * pixel * 1e-3, rel=5e-3)

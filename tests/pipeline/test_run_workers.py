@@ -69,6 +69,32 @@ def test_parts_share_a_folder_and_the_last_writes_the_report(finished_run, tmp_p
     assert contents(tmp_path / "run") == contents(finished_run)
 
 
+@pytest.mark.long
+def test_parts_with_a_ccd_each_that_cannot_be_modelled_end_with_a_report(tmp_path, tiny, monkeypatch):
+    real, reason = run_folder.model_ccds, "3 of 12 stars left"
+    bad = {"R22_S11", "R22_S12"}
+
+    def fails(experiment, exposures):
+        products = iter(real(experiment, [e for e in exposures if e.name not in bad]))
+        return [DomainError(reason) if e.name in bad else next(products) for e in exposures]
+
+    monkeypatch.setattr(run_folder, "model_ccds", fails)
+    config = tiny(ccds=("R22_S11", "R22_S12", "R24_S12"))
+    first = run(config, tmp_path / "run", part=(1, 2))
+    assert (first.not_modelled, first.missing, first.report) == ({"R22_S11": reason}, ("R22_S12",), None)
+    last = run(config, tmp_path / "run", part=(2, 2))
+    assert last.not_modelled == last.summary["not_modelled"] == {"R22_S11": reason, "R22_S12": reason}
+    assert last.report is not None
+    run(config, tmp_path / "whole")
+    whole = contents(tmp_path / "whole")
+    assert {name: text for name, text in contents(tmp_path / "run").items() if name in whole} == whole
+    # It is tried again by the part that it belongs to, and the other one learns of it.
+    bad.remove("R22_S11")
+    again = run(config, tmp_path / "run", part=(1, 2))
+    assert (again.computed, again.not_modelled) == (("R22_S11",), {"R22_S12": reason})
+    assert [path.name for path in (tmp_path / "run").glob("not_modelled*")] == ["not_modelled_R22_S12.json"]
+
+
 @pytest.mark.parametrize("part", [(0, 2), (3, 2), (1, 0)])
 def test_a_part_that_is_none_is_refused(tmp_path, tiny, part):
     with pytest.raises(DomainError, match=f"part = {part[0]}/{part[1]}: expected i/n"):

@@ -127,6 +127,35 @@ def test_derivatives_by_motions(system, name):
         assert np.abs(motion[:, k] - numeric).max() < 3e-10
 
 
+@pytest.mark.parametrize("gaps", [(0,), (1, 2), (3,)])
+def test_derivatives_by_refractive_indices(system, gaps):
+    """Of the medium in gaps in front of surfaces: before both lenses, between them, where a mirror is, and after."""
+    rays = start()
+    forward = forward_pass(system, rays)
+    gradient = position_gradient(forward)
+    four = replace(
+        gradient,
+        position=np.concatenate([gradient.position, np.zeros((1, 3, 20))]),
+        direction=np.zeros((4, 3, 20)),
+        path=np.array([0.0, 0.0, 0.0, 1.0]),
+    )
+    matrix = backward_pass(forward, four)
+    found = sum(matrix.index(gap)[:, 0] + (matrix.index(gap - 1)[:, 1] if gap else 0.0) for gap in gaps)
+
+    def changed(h):
+        media = [system.medium_before, *(s.medium_after for s in system.surfaces)]
+        for gap in gaps:
+            media[gap] = ConstantIndex(media[gap].n + h)
+        surfaces = tuple(replace(s, medium_after=m) for s, m in zip(system.surfaces, media[1:], strict=True))
+        end = pachon.trace(replace(system, surfaces=surfaces, medium_before=media[0]), rays)
+        return np.concatenate([end.position.T, end.path_length[None]])
+
+    numeric = (8.0 * (changed(1e-4) - changed(-1e-4)) - (changed(2e-4) - changed(-2e-4))) / 12e-4
+    # Rounding of 1e-16 m in the outputs over steps of 1e-4.
+    assert np.abs(found - numeric).max() < 1e-11
+    assert np.abs(numeric[:3]).max() > 1e-4
+
+
 def test_thin_lenses_are_planes_with_a_lens():
     with pytest.raises(PrescriptionError, match="thin_lens: expected one of a thin lens, and of that alone"):
         pachon.Surface("L", pachon.Interaction.THIN_LENS, pachon.Plane(), (0, 0, 0), AIR)

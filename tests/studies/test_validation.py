@@ -111,6 +111,19 @@ def test_lens_files_and_heights(tmp_path):
     assert pachon.validate_file(tmp_path / "heights.csv").problems
 
 
+def test_a_list_makes_visits_a_night(tmp_path):
+    path = tmp_path / "night.yaml"
+    path.write_text("run: {ccds: [R22]}\nvisits: {list: baseline.db, band: r}\n")
+    found = pachon.validate_file(path)
+    assert (found.kind, found.problems) == ("night", ())
+    path.write_text("run: {ccds: [R22]}\nvisits: {list: baseline.db, bands: r}\nmaps: {nsid: 1024}\n")
+    found = pachon.validate_file(path)
+    assert found.kind == "night"
+    assert places(found) == {("line 2", "visits.bands"), ("line 3", "maps.nsid")}
+    path.write_text("run: {ccds: [R22]}\nvisits: {count: 3}\n")
+    assert pachon.validate_file(path).kind == "visits"
+
+
 def test_unknown_files(tmp_path):
     for name, text in (("a.docx", "x"), ("b.yaml", "colour: red\n")):
         (tmp_path / name).write_text(text)

@@ -56,6 +56,8 @@ _DRAWN = round(_TABLE * _HIGHEST / _LAST)
 #: highest layer crosses the pupil, and its directions.
 _CROSSINGS = 2.0
 _DIRECTIONS = 8
+#: Least variance of the differences of stars over that of their moments that is more than rounding.
+_DIFFERENT = 1e-6
 #: Factor of modes without frequency along x, and with the highest one: the inverse transform takes the mean of those at
 #: a frequency along y and at its opposite.
 _BOTH_SIGNS = np.float32(math.sqrt(2.0))
@@ -198,14 +200,16 @@ def amplitudes_by_light(air: ExposedAir, response: MomentResponse, most: float) 
     angle = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     lags = np.concatenate([np.zeros((1, 2)), apart * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
 
-    def variances(lit: tuple[float, ...]) -> np.ndarray:
+    def variances(lit: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
         total = moment_covariance(air, lags, response.aberration, lit, sampling=COARSE).total(response)[:, :3]
-        return np.asarray(total[0] - total[1:].mean(axis=0))
+        return total[0] - total[1:].mean(axis=0), total[0]
 
     levels = response.lit_levels or (response.lit,)
-    usual = variances(response.lit)
-    relative = np.stack([variances(lit) for lit in levels]) / np.where(usual > 0.0, usual, 1.0)
-    return np.array([lit[0] for lit in levels]), np.sqrt(np.where(usual > 0.0, relative, 1.0))
+    usual, whole = variances(response.lit)
+    # Through a layer at the pupil alone stars have no differences.
+    differ = usual > _DIFFERENT * whole
+    relative = np.stack([variances(lit)[0] for lit in levels]) / np.where(differ, usual, 1.0)
+    return np.array([lit[0] for lit in levels]), np.sqrt(np.where(differ, np.maximum(relative, 0.0), 1.0))
 
 
 def _factors(spectra: np.ndarray, scale: float) -> tuple[tuple[np.ndarray, ...], ...]:

@@ -126,6 +126,11 @@ class PsfEngine(ABC):
     def _renderer(self, inputs: PsfInputs) -> PsfRenderer:
         """Return the renderer of the stars of one call."""
 
+    @staticmethod
+    def order(fields: np.ndarray) -> np.ndarray:
+        """Return indices of stars at field angles [n_star, 2] [rad] in the order in which they are rendered."""
+        return np.arange(len(fields))
+
     def with_n_pupil(self, n_pupil: int | None) -> Self:
         """Return the engine with another number of pupil points; the same one if it has no such option."""
         options: dict[str, Any] = {"n_pupil": n_pupil}
@@ -166,8 +171,8 @@ class PsfRenderer(ABC):
         return [order[first : first + self.batch] for first in range(0, len(order), self.batch)]
 
     def _order(self, fields: np.ndarray) -> np.ndarray:
-        """Return indices of stars in the order in which they are rendered, [n_star]."""
-        return np.arange(len(fields))
+        """Return indices of stars in the order in which they are rendered, [n_star], that of the engine."""
+        return PsfEngine.order(fields)
 
     def render(
         self,

@@ -127,6 +127,11 @@ class LongExposureEngine(PsfEngine):
     def _renderer(self, inputs: PsfInputs) -> LongExposureRenderer:
         return LongExposureRenderer(inputs, self)
 
+    @staticmethod
+    def order(fields: np.ndarray) -> np.ndarray:
+        """Return indices of stars from the centre outwards, so that those that lose much light share a few batches."""
+        return np.argsort(np.hypot(*fields.T), kind="stable")
+
 
 class LongExposureRenderer(PsfRenderer):
     """Renderer of :class:`LongExposureEngine`."""
@@ -252,8 +257,7 @@ class LongExposureRenderer(PsfRenderer):
         self._fade_y = spread.astype(np.float32)
 
     def _order(self, fields: np.ndarray) -> np.ndarray:
-        # From the centre outwards, so that stars that lose much light share a few batches.
-        return np.argsort(np.hypot(*fields.T), kind="stable")
+        return LongExposureEngine.order(fields)
 
     def _expose(self, stars: Stars) -> ExposedStars:
         if self._general:

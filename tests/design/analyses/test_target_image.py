@@ -38,6 +38,17 @@ def test_the_image_lies_where_the_rays_land_and_keeps_the_light(paraboloid):
     assert result.light_inside == pytest.approx(1.0, rel=1e-12)
 
 
+def test_vignetting_factors_narrow_the_blur(paraboloid):
+    factors, fields = ((0.0, 0.0, 0.0, 0.5, 0.0),), ((0.0, 0.0),)
+    telescope = paraboloid(2.0, 10.0, shift=1e-3).with_design(field_type="angle", fields=fields, vignetting=factors)
+    request, target = pachon.Request.of(telescope, one_wavelength=True), np.pad([[1.0]], 2)
+    image = pachon.design.target_image(request, target, width=5e-7, n_rays=1000, pixel=1e-6, pixels=121).image
+    place = np.arange(121) - 60.0
+    along_x, along_y = (np.sqrt(image.sum(axis=axis) @ place**2 / image.sum()) for axis in (0, 1))
+    assert along_x == pytest.approx(25.0, rel=0.01)
+    assert along_y == pytest.approx(12.5, rel=0.01)
+
+
 def test_bars_are_as_wide_as_their_gaps():
     target = pachon.design.bar_target(100, bars=3)
     row = target[50]
@@ -51,5 +62,7 @@ def test_bad_targets(paraboloid):
     for target, problem in ((np.zeros((4, 4)), "some light"), (np.ones(4), "shape"), (-np.ones((3, 3)), "negative")):
         with pytest.raises(DomainError, match=problem):
             pachon.design.target_image(paraboloid(), target)
+    with pytest.raises(DomainError, match=r"^field: 2 fields are given; expected one$"):
+        pachon.design.target_image(pachon.Request.of(paraboloid(), [[0.0, 0.0], [0.0, 1e-3]]))
     with pytest.raises(DomainError, match="bars = 9"):
         pachon.design.bar_target(64, bars=9)

@@ -86,8 +86,22 @@ def test_vignetting_factors_take_their_part_of_the_entrance_pupil(paraboloid):
     result = pachon.design.throughput(telescope, wavelengths=5e-7)
     assert result.value[:, 0] == pytest.approx([1.0, 0.8 * 0.5], rel=1e-12)
     assert result.lit_fraction == pytest.approx(result.value)
-    light = pachon.design.relative_illumination(pachon.Request.of(telescope, one_wavelength=True))
+    request = pachon.Request.of(telescope, one_wavelength=True)
+    light = pachon.design.relative_illumination(request)
     assert light.lit_fraction == pytest.approx([1.0, 0.8 * 0.5], rel=1e-12)
+
+
+def test_lit_fractions_of_one_request_are_the_same_everywhere(paraboloid):
+    factors, fields = ((0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.1, 0.2, 0.5, 0.3)), ((0.0, 0.0), (0.0, 5e-3))
+    telescope = paraboloid(2.0, 10.0).with_design(field_type="angle", fields=fields, vignetting=factors)
+    request, size = pachon.Request.of(telescope, one_wavelength=True), {"pixels": 9, "pixel": 20e-6}
+    for result, tolerance in (
+        (pachon.spots(request), 1e-12),
+        (pachon.vignetting(request, n_pupil=64), 1e-12),
+        (pachon.fft_psf(request, n_pupil=64, **size), 0.02),  # by parts of cells on the rim
+        (pachon.huygens_psf(request, sampling="gauss", **size), 1e-12),
+    ):
+        assert result.lit_fraction == pytest.approx([1.0, 0.8 * 0.5], rel=tolerance), type(result).__name__
 
 
 @pytest.mark.parametrize(

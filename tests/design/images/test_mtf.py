@@ -1,12 +1,16 @@
 """Modulation transfer against closed forms and the transform of the image."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
+from scipy.special import j1
 
 from pachon.core.errors import DomainError
 from pachon.design.images.diffraction import fft_psf
 from pachon.design.images.mtf import mtf
 from pachon.design.metrics.spots import spots
+from pachon.wavefront.request import Request
 
 WAVE = 500e-9
 
@@ -134,3 +138,16 @@ def test_the_lattice_is_as_fine_as_spots_need(paraboloid):
     assert len(found.frequency) > 400
     low = found.frequency < 2e3
     assert found.tangential[0, low] == pytest.approx(found.geometric_tangential[0, low], abs=0.02)
+
+
+def test_many_rays_take_no_more_memory_than_some(paraboloid):
+    """The contrast of a disc of light, of 100000 rays."""
+    request = Request.of(paraboloid(f_number=20.0, shift=1e-3), [[0.0, 0.0]], WAVE, sampling="spiral", n_pupil=100_000)
+    tracemalloc.start()
+    found = mtf(request, n_pupil=64)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # All at once, with two complex numbers a ray and frequency, they take 200 MB and more.
+    assert peak < 100e6
+    argument = np.pi * (1e-3 / 20.0) * found.frequency[1:20]
+    assert found.geometric_tangential[0, 1:20] == pytest.approx(np.abs(2.0 * j1(argument) / argument), abs=1e-3)

@@ -145,6 +145,9 @@ def test_only_the_brightest(with_plate):
     assert one.flux == one.ghosts[0].flux < everything.flux
     with pytest.raises(DomainError, match="brightest"):
         ghosts(with_plate, (0.0, 0.0), brightest=0)
+    several = pachon.Request.of(with_plate, [[0.0, 0.0], [0.0, 1e-3]])
+    with pytest.raises(DomainError, match=r"^field: 2 fields are given; expected one$"):
+        ghosts(several, n_pupil=4000)
 
 
 def test_a_ghost_of_too_few_rays_has_no_irradiance(with_plate):

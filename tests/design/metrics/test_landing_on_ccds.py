@@ -26,6 +26,11 @@ FIELDS = pachon.fields_at(TELESCOPE, LIFTED.camera.centers[[94, 10]] + 1e-3)
         lambda t, **on: (
             pachon.encircled_energy(t, FIELDS, kind="geometric", n_pupil=200, radii=[5e-6, 2e-5], **on).fraction
         ),
+        pytest.param(
+            lambda t, **on: pachon.encircled_energy(t, FIELDS[:1], radii=[3e-6], **on).fraction, marks=pytest.mark.long
+        ),
+        pytest.param(lambda t, **on: pachon.strehl(t, FIELDS[:1], **on).psf, marks=pytest.mark.long),
+        lambda t, **on: pachon.fft_psf(t, FIELDS[:1], pixels=9, n_pupil=64, pixel=2e-6, **on).strehl,
     ],
 )
 def test_a_focal_plane_that_is_lifted_is_a_detector_that_is_moved(analysis):
@@ -40,6 +45,8 @@ def test_a_focal_plane_that_is_lifted_is_a_detector_that_is_moved(analysis):
         lambda r: pachon.wavefront_zernikes(r, jmax=11).coefficients,
         lambda r: pachon.ray_fans(r).displacement,
         lambda r: pachon.wavefront_opds(r, grid=8).value,
+        lambda r: 1e-9 * pachon.huygens_psf(r, pixels=9, pixel=2e-6, sampling="gauss").image,
+        lambda r: 1e-9 * pachon.mtf(r.at_fields(slice(1)), n_pupil=64).tangential,
     ],
 )
 def test_a_request_takes_its_focal_plane_along(analysis):
@@ -48,10 +55,27 @@ def test_a_request_takes_its_focal_plane_along(analysis):
     np.testing.assert_allclose(analysis(flat.on(LIFTED)), analysis(moved), rtol=0, atol=2e-11)
 
 
+def test_images_stand_on_the_slope_of_a_ccd():
+    """A CCD turned about its centre, on the axis, is a detector that is turned."""
+    camera, angle = LIFTED.camera, 2e-3
+    name = camera.ccd_names[int(camera.ccd_at(0.0, 0.0))]
+    tilted = pachon.FocalPlane.flat().with_moved(name, rx=angle)
+    turned = TELESCOPE.perturbed("Detector", tilt=(angle, 0.0, 0.0))
+    field = pachon.fields_at(TELESCOPE, np.array([[0.0, 0.01]]))
+    on_ccd, on_turned, flat = (
+        pachon.fft_psf(t, field, pixels=17, n_pupil=128, pixel=2e-6, reference="chief", focal_plane=plane).image
+        for t, plane in ((TELESCOPE, tilted), (turned, None), (TELESCOPE, None))
+    )
+    assert np.abs(on_ccd - on_turned).max() < 1e-3 * on_turned.max()
+    assert np.abs(on_ccd - flat).max() > 0.1 * flat.max()
+
+
 def test_light_between_the_ccds_is_lost():
     edge = LIFTED.camera.centers[94] + [LIFTED.camera.half_sizes[94, 0], 0.0]
     field = pachon.fields_at(TELESCOPE, edge[None])
     lit = pachon.spots(TELESCOPE, field, focal_plane=pachon.FocalPlane.flat()).lit_fraction
+    request = pachon.Request.of(TELESCOPE, field, TELESCOPE.default_wavelength).on(pachon.FocalPlane.flat())
+    assert pachon.design.throughput(request).lit_fraction[0] == pytest.approx(lit, abs=1e-12)
     nominal = pachon.spots(TELESCOPE, field)
     landing = nominal.displacement[0, 0] + nominal.reference_point[0]
     on_ccd = LIFTED.ccd_at(*landing.T) >= 0

@@ -69,6 +69,18 @@ def test_quadratic_compensation_is_the_best_focus(triplet, built):
     assert best > 1.002 * built.nominal
 
 
+def test_transfer_is_that_along_the_field_wherever_the_field_lies(triplet):
+    """A lens of revolution has the same merit at fields on any meridian."""
+    slope = np.tan(np.deg2rad(11.0))
+    fields = np.arctan(slope * np.array([[[0.0, 1.0]], [[np.sqrt(0.5), np.sqrt(0.5)]], [[-0.6, 0.8]]]))
+    along_y, *others = (
+        Criterion.of("mtf", triplet, Beams.of(triplet, field, n_pupil=3), frequency=2e4).measure(triplet)
+        for field in fields
+    )
+    # The lattice of pupil points has square symmetry; directions of x and y give 0.016 less.
+    assert others == pytest.approx([along_y, along_y], abs=4e-3)
+
+
 @pytest.mark.slow
 def test_methods_and_their_yields_agree(triplet):
     """Tolerances of good work: merits within 2 per cent of their spread, yields within their binomial errors."""

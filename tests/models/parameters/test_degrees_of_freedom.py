@@ -19,6 +19,7 @@ from pachon.models.parameters.degrees_of_freedom import DegreeOfFreedom, Degrees
 from pachon.models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
 from pachon.models.parameters.parameters import apply
 from pachon.models.parameters.thermal import thermal
+from pachon.models.shapes.freeform import OddAsphere, Toroid
 from pachon.models.shapes.grid import GridSag
 from pachon.models.shapes.modes import GridModes
 from pachon.models.shapes.polynomial import ZernikeSag
@@ -257,6 +258,31 @@ def test_a_lens_that_warms_up(lsst_r):
     change = warm.surface(name).medium_after.index(6e-7) - lsst_r.surface(name).medium_after.index(6e-7)
     assert change == pytest.approx(1e-4, rel=1e-9)
     assert warm.surface("L1_exit") == lsst_r.surface("L1_exit")
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        Toroid(4.0, -6.0, -0.7, (2e-3, -1e-3)),
+        OddAsphere(5.0, -0.5, (1e-3, 2e-3, -3e-3)),
+    ],
+)
+def test_a_warm_shape_is_a_larger_one(lsst_r, shape):
+    warm = DegreesOfFreedom((thermal(lsst_r.with_shape("M1", shape), {"M1": 1e-6}),))
+    larger = warm.apply(lsst_r.with_shape("M1", shape), [1.0]).surface("M1").shape
+    x, y = np.random.default_rng(1).uniform(-0.6, 0.6, (2, 20))
+    grown = (1.0 + 1e-6) * shape.sag(x / (1.0 + 1e-6), y / (1.0 + 1e-6))
+    # Second order of the expansion, and rounding.
+    assert np.abs(larger.sag(x, y) - grown).max() < 1e-14
+    assert np.abs(shape.sag(x, y) - grown).max() > 1e-8
+
+
+def test_lines_of_a_warm_grating_are_farther_apart(lsst_r):
+    grating = pachon.models.Grating(1, 100.0)
+    surfaces = tuple(dataclasses.replace(s, grating=grating if s.name == "M2" else None) for s in lsst_r.surfaces)
+    telescope = dataclasses.replace(lsst_r, surfaces=surfaces)
+    warm = DegreesOfFreedom((thermal(telescope, {"M2": 2e-5}),)).apply(telescope, [10.0])
+    assert warm.surface("M2").grating.lines_per_mm == pytest.approx(100.0 * (1.0 - 2e-4), rel=1e-12)
 
 
 def test_powers_of_lengths():

@@ -13,6 +13,7 @@ from pachon.models.parameters.parameters import (
     with_shape_terms,
 )
 from pachon.models.parameters.shape_terms import term_polynomial, term_unit
+from pachon.models.shapes.freeform import Toroid
 from pachon.models.shapes.polynomial import XYPolynomial, ZernikeSag
 from pachon.models.shapes.shape import Conic, EvenAsphere
 from pachon.models.shapes.sum import Sum
@@ -172,6 +173,8 @@ def test_what_is_no_polynomial():
     assert term_polynomial(Conic(3.0, 0.0), "radius") is None
     assert term_unit(XYPolynomial(((2, 1, 0.1),)), "x2y1") == "m^-2"
     assert term_unit(XYPolynomial(((1, 0, 0.1),)), "x1y0") == ""
+    toroid = Toroid(4.0, -6.0, -0.7, (2e-3, -1e-3))
+    assert [term_unit(toroid, name) for name in ("radius_x", "conic_y", "y2", "y4")] == ["m", "", "m^-1", "m^-3"]
 
 
 def test_new_terms_change_no_sag(lsst_r):

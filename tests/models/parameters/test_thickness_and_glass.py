@@ -9,6 +9,7 @@ import pachon
 from pachon.core.errors import DomainError, UnknownNameError
 from pachon.design.optimize.jacobian import ParameterColumns
 from pachon.design.optimize.merit import Beams, SpotMerit, WavefrontMerit
+from pachon.models.design_data import DesignData
 from pachon.models.io.glass_catalogue import GlassCatalogue
 from pachon.models.media.medium import ChangedIndex, ConstantIndex, abbe_number, with_index_change
 from pachon.models.parameters.parameters import Parameter, apply, parse_parameters, twists
@@ -37,6 +38,21 @@ def test_a_thickness_moves_all_that_is_behind(lsst_r, triplet):
     # Groups behind move with their pivots: a tilt afterwards is about the moved one.
     assert further.group_frames["Camera"][0][2] == pytest.approx(lsst_r.group_frames["Camera"][0][2] - 1e-3)
     assert further.group_frames["L1"][0][2] == pytest.approx(further.surface("L1_entrance").vertex[2])
+
+
+def test_an_index_ends_at_a_thin_lens_into_another_medium(triplet):
+    glass, air = ConstantIndex(1.5), ConstantIndex(1.0)
+    front = pachon.Surface("front", pachon.Interaction.REFRACT, pachon.Plane(), (0.0, 0.0, 0.0), glass)
+    inside, last = (
+        pachon.Surface(name, pachon.Interaction.THIN_LENS, pachon.Plane(), (0.0, 0.0, z), medium,
+                       thin_lens=pachon.models.ThinLens(0.1))
+        for name, z, medium in (("inside", -0.01, glass), ("last", -0.02, air))
+    )  # fmt: skip
+    image = pachon.Surface("Image", pachon.Interaction.DETECTOR, pachon.Plane(), (0.0, 0.0, -0.1), air)
+    lens = replace(triplet, surfaces=(front, inside, last, image), groups={}, design_data=DesignData())
+    changed = apply(lens, {"front.n": 0.1})
+    indices = [float(s.medium_after.index(WAVES[0])) for s in changed.surfaces]
+    assert indices == pytest.approx([1.6, 1.6, 1.0, 1.0], rel=1e-15)
 
 
 def test_twists_with_thicknesses(lsst_r, slope):

@@ -6,10 +6,12 @@ import math
 import numpy as np
 import pytest
 
+import pachon
 from pachon.core.errors import ConfigError, DomainError
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.simulate import ccd_loop
 from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_ccd, expose_ccds
+from pachon.pipeline.simulate.ccd_model import model_ccds
 from pachon.pipeline.simulate.photometry import PROVISIONAL_FWHM
 from pachon.wavefront.chief_rays import fields_at, fields_of_groups
 
@@ -35,6 +37,34 @@ def test_ccds_exposed_together_have_the_bytes_of_each_alone(experiment, stars):
         for kind in ("holdout", "observed", "centered"):
             for name, values in vars(getattr(alone, kind)).items():
                 assert np.array_equal(getattr(getattr(exposure, kind), name), values), (kind, name)
+
+
+@pytest.mark.parametrize("engine", ["long_exposure", pytest.param("statistical", marks=pytest.mark.long)])
+def test_stars_that_an_engine_draws_in_an_order_of_its_own_are_drawn_twice(tiny, engine):
+    """Of stars drawn at their places and on the centre of a pixel each image is that of its star."""
+    experiment = Experiment.from_config(tiny(ccds=NAMES, psf__engine=engine, atmosphere__exposure_s=5.0))
+    stars = {name: ccd_stars(experiment, name, PROVISIONAL_FWHM) for name in NAMES}
+    twice, once = (expose_ccds(experiment, stars, centered=centered, threads=1) for centered in (True, False))
+    for both, alone in zip(twice, once, strict=True):
+        np.testing.assert_array_equal(both.observed.image, alone.observed.image)
+        np.testing.assert_array_equal(both.observed.fields, alone.observed.fields)
+
+
+@pytest.mark.parametrize("names", [NAMES, NAMES[:1]])
+def test_a_ccd_on_which_a_catalogue_has_no_star_cannot_be_modelled(tiny, tmp_path, names):
+    """As one of a night, each of whose visits has other stars on its CCDs."""
+    camera = pachon.lsst_camera()
+    x, y = (camera.centers[camera.ccd_index(NAMES[1])] + np.random.default_rng(1).uniform(-0.015, 0.015, (12, 2))).T
+    rows = [f"{a},{b},20.0" for a, b in zip(x, y, strict=True)]
+    (tmp_path / "stars.csv").write_text("\n".join(["x_m,y_m,mag", *rows]) + "\n")
+    catalogue = str(tmp_path / "stars.csv")
+    experiment = Experiment.from_config(tiny(ccds=NAMES, psf__engine="long_exposure", stars__catalogue=catalogue))
+    stars = {name: ccd_stars(experiment, name, PROVISIONAL_FWHM) for name in names}
+    simulated = ccd_loop.simulate_ccds(
+        experiment, lambda exposures: model_ccds(experiment, exposures), names, fields=stars, strict=False
+    )
+    assert simulated.not_modelled[NAMES[0]].startswith("0 of 0 stars left: expected at least ")
+    assert tuple(simulated.results) == names[1:]
 
 
 def test_fields_of_groups_have_the_bytes_of_each_alone(experiment, stars):

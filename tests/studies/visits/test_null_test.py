@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import numpy as np
@@ -12,6 +13,7 @@ from pachon.core.units import ARCMIN, ARCSEC
 from pachon.imaging.exposure import Exposure
 from pachon.measure.shear.shear_shapes import ShearShapes
 from pachon.measure.shear.shear_shapes import shear_bias as shear_bias_of_functionals
+from pachon.measure.shear.weight import weight_sigma
 from pachon.sky.galaxies import Galaxies
 from pachon.studies.visits import null_test as module
 from pachon.studies.visits.galaxy_shapes import GalaxyShapes, measure_galaxies, stamp_sides
@@ -286,6 +288,28 @@ def test_functionals_of_the_null_test_have_the_shear_without_bias():
     assert (np.abs(bias.c) < 4.0 * bias.c_error + 1e-3).all()
     # A model without the ellipticity of the PSF leaves a part of it.
     assert (shear_bias_of_functionals(pair[0].shear, pair[1].shear, 0.02, 0.0).c > 0.01).all()
+
+
+def test_tiles_under_psfs_of_other_widths_have_one_weight():
+    """Ellipticities under other weights have other responses, and the mean response is that of all tiles."""
+    stack = stack_of(gaussian(0j, 1.9), gaussian(0j, 1.9))
+    wide = stack.xi > 0.0
+    stack.true[wide] = stack.model[wide] = gaussian(0j, 2.3)
+    exposure, many = Exposure(noise=False, exposures=400), galaxies(30)
+
+    def galaxies_in(xi, eta):
+        # The same galaxies on every tile.
+        middle = np.mean(xi), np.mean(eta)
+        return dataclasses.replace(many, xi=0.3 * many.xi + middle[0], eta=0.3 * many.eta + middle[1])
+
+    depth = module._StackMeasurement(stack, AXES, exposure, galaxies_in, 1, 2.0 * ARCMIN, 0.7 * ARCMIN)
+    tiles = [(-1, 0), (1, 0)]
+    jobs = list(depth.jobs(tiles, tiles, 10))
+    assert {job["sigma"] for job in jobs} == {weight_sigma(None, stack.true, exposure.pixel_scale)}
+    assert not (jobs[0]["stack"].true == gaussian(0j, 2.3)).all(axis=(1, 2)).any()
+    one, other = (module.measure_job(job, 1).shear for job in jobs[:2])
+    # The functionals are those before the PSF.
+    np.testing.assert_allclose(one.r11, other.r11, rtol=0.02)
 
 
 def test_a_tile_with_numbers_that_are_not_finite_is_refused(tmp_path):

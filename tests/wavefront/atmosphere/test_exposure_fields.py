@@ -91,6 +91,17 @@ def test_stars_with_less_light_have_larger_moments():
     assert factors[1] == pytest.approx(0.5 * (gain.amplitudes[1] + 1.0))
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_layer_at_the_pupil_alone_makes_no_differences():
+    """All stars have the same moments, whatever light they have: rounding is no amplitude."""
+    response = RESPONSE._replace(lit_levels=((0.5, 0.5, 0.5), (0.7, 0.3, 0.05), (1.0,)))
+    for velocity in ((3.0, 2.0), (8.0, 0.0), (-4.0, 1.5), (2.0, 7.0)):
+        air = AIR._replace(altitudes=(0.0,), weights=(1.0,), velocities=(velocity,))
+        fractions, amplitudes = exposure_fields.amplitudes_by_light(air, response, FIELD_RADIUS)
+        assert fractions.tolist() == [0.5, 0.7, 1.0]
+        assert (amplitudes == 1.0).all()
+
+
 def test_modes_are_those_of_white_noise():
     """600 grids of 8 x 8: unit variance, and one power at all frequencies, also those whose opposite is themselves.
 
