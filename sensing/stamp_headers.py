@@ -224,8 +224,9 @@ def _parallactic_angle(header: fits.Header, file: Path) -> float | None:
         if azimuth_key in header and altitude_key in header:
             azimuth, altitude = _finite(header, azimuth_key, file), _finite(header, altitude_key, file)
             if azimuth is not None and altitude is not None:
-                latitude = _finite(header, "OBS-LAT", file) if "OBS-LAT" in header else _LATITUDE
-                return parallactic_angle(*np.deg2rad([azimuth, altitude, latitude or _LATITUDE]))
+                latitude = _finite(header, "OBS-LAT", file) if "OBS-LAT" in header else None
+                degrees = azimuth, altitude, _LATITUDE if latitude is None else latitude
+                return parallactic_angle(*np.deg2rad(degrees))
     return None
 
 

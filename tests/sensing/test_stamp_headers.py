@@ -153,6 +153,17 @@ def test_an_exposure_of_the_lsst_is_cut_at_pixels_of_its_ccd(tmp_path):
     assert (values.gain, values.model) == (1.0, "rubin_v3.14_i")
 
 
+def test_the_latitude_of_a_telescope_on_the_equator_counts(tmp_path):
+    """Seen from the equator the pole is on the horizon: 90 degrees from the zenith of a star in the east."""
+    header = fits.Header({"INSTRUME": "LSSTCam", "BORE-AZ": 90.0, "BORE-ALT": 45.0, "OBS-LAT": 0.0})
+    east = np.deg2rad(90.0)
+    assert abs(header_values([header], tmp_path).parallactic_angle) == pytest.approx(east, abs=1e-12)
+    header["OBS-LAT"] = -30.244639
+    there = header_values([header], tmp_path).parallactic_angle
+    del header["OBS-LAT"]
+    assert header_values([header], tmp_path).parallactic_angle == there != pytest.approx(east, abs=0.1)
+
+
 def test_weights_and_planes_of_files_of_their_own(tmp_path):
     image = np.ones((2, 12, 12), np.float32)
     weight = np.full((2, 12, 12), 0.25, np.float32)
