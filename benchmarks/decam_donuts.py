@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -47,16 +48,8 @@ def read(folder: Path) -> tuple[DonutWork, list[str]]:
 
 def fit_pachon(work: DonutWork, last: int, kind: type = pachon.sensing.SingleDonuts) -> pachon.sensing.DonutFit:
     """Fit donuts by pachon as the command does."""
-    return pachon.fit_donuts(
-        work.believed,
-        work.inputs.images,
-        work.inputs.fields,
-        work.light,
-        model=work.model,
-        fit=kind(noll=range(4, last + 1), higher_order=10e-9),
-        projection=work.projection,
-        threads=1,
-    )
+    wavefront = kind(noll=range(4, last + 1), higher_order=10e-9)
+    return replace(work, wavefront=wavefront, threads=1).fit(lambda _: None)
 
 
 def circles(shape) -> list[tuple[float, str, bool]]:

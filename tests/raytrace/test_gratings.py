@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from adjoint_outputs import position_and_path
 
 import pachon
 from pachon.core.errors import PrescriptionError
@@ -11,7 +12,7 @@ from pachon.models.media.medium import ConstantIndex
 from pachon.models.parameters.parameters import apply
 from pachon.models.rotation import rotation_matrix
 from pachon.raytrace.adjoint.adjoint_matrix import column_table
-from pachon.raytrace.adjoint.backward_pass import backward_pass, landing_gradient, position_gradient
+from pachon.raytrace.adjoint.backward_pass import backward_pass, landing_gradient
 from pachon.raytrace.adjoint.forward_pass import forward_pass
 
 WAVELENGTH = 550e-9
@@ -172,14 +173,7 @@ def responses(spectrograph):
     start = replace(start, position=start.position + np.array([0.0, 0.0, 0.1]))
     forward = forward_pass(spectrograph, start)
     assert (forward.status == pachon.RayStatus.OK).all()
-    gradient = position_gradient(forward)
-    # The landing point and the path, four outputs.
-    four = replace(
-        gradient,
-        position=np.concatenate([gradient.position, np.zeros((1, 3, 20))]),
-        direction=np.zeros((4, 3, 20)),
-        path=np.array([0.0, 0.0, 0.0, 1.0]),
-    )
+    four = position_and_path(forward)
     table = column_table(spectrograph, [*((s, name) for s in range(4) for name in QUANTITIES), (4, "gap")])
     return start, backward_pass(forward, four, table), four
 

@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from adjoint_outputs import position_and_path
 
 import pachon
 from pachon.core.errors import PrescriptionError
 from pachon.models.media.medium import ConstantIndex
 from pachon.models.rotation import rotation_matrix
 from pachon.models.surface import IDENTITY
-from pachon.raytrace.adjoint.backward_pass import backward_pass, position_gradient
+from pachon.raytrace.adjoint.backward_pass import backward_pass
 from pachon.raytrace.adjoint.forward_pass import forward_pass
 
 WAVELENGTH = 550e-9
@@ -104,13 +105,7 @@ def test_derivatives_by_motions(system, name):
     rays = start()
     forward = forward_pass(system, rays)
     assert (forward.status == pachon.RayStatus.OK).all()
-    gradient = position_gradient(forward)
-    four = replace(
-        gradient,
-        position=np.concatenate([gradient.position, np.zeros((1, 3, 20))]),
-        direction=np.zeros((4, 3, 20)),
-        path=np.array([0.0, 0.0, 0.0, 1.0]),
-    )
+    four = position_and_path(forward)
     motion = backward_pass(forward, four).motion(system.surface_names.index(name))
     for k in range(6):
 
@@ -132,13 +127,7 @@ def test_derivatives_by_refractive_indices(system, gaps):
     """Of the medium in gaps in front of surfaces: before both lenses, between them, where a mirror is, and after."""
     rays = start()
     forward = forward_pass(system, rays)
-    gradient = position_gradient(forward)
-    four = replace(
-        gradient,
-        position=np.concatenate([gradient.position, np.zeros((1, 3, 20))]),
-        direction=np.zeros((4, 3, 20)),
-        path=np.array([0.0, 0.0, 0.0, 1.0]),
-    )
+    four = position_and_path(forward)
     matrix = backward_pass(forward, four)
     found = sum(matrix.index(gap)[:, 0] + (matrix.index(gap - 1)[:, 1] if gap else 0.0) for gap in gaps)
 

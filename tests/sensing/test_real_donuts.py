@@ -1,5 +1,6 @@
 """Real donuts of one DECam exposure: test/input of aaronroodman/Donut, MIT; skipped where they are not at hand."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,19 +23,6 @@ def stars_of_one_ccd():
     return DonutWork.of(telescope, StampOptions(), FrameOptions(), FitOptions(each_alone=True))
 
 
-def fitted(work, fit):
-    return pachon.fit_donuts(
-        work.believed,
-        work.inputs.images,
-        work.inputs.fields,
-        work.light,
-        model=work.model,
-        fit=fit,
-        projection=work.projection,
-        threads=1,
-    )
-
-
 def test_stars_of_one_exposure_repeat(stars_of_one_ccd, monkeypatch):
     """Most of what is claimed is common to them: figure of the mirror and air, which are no rim elsewhere."""
 
@@ -42,7 +30,8 @@ def test_stars_of_one_exposure_repeat(stars_of_one_ccd, monkeypatch):
         raise AssertionError("a figure of the mirror was taken for a rim elsewhere")
 
     monkeypatch.setattr(rim_search, "_each_freed", tried)
-    fit = fitted(stars_of_one_ccd, pachon.sensing.SingleDonuts(range(4, 12), higher_order=10e-9))
+    wavefront = pachon.sensing.SingleDonuts(range(4, 12), higher_order=10e-9)
+    fit = replace(stars_of_one_ccd, wavefront=wavefront, threads=1).fit(lambda _: None)
     assert fit.usable.all()
     assert len(fit.rims) == 0
     about = fit.zernikes - fit.zernikes.mean(axis=0)
