@@ -156,7 +156,8 @@ def fit_star(
     if donut and search.misfit > _POOR and not _is_between(_size(search.start.stamp, search.best), _LIKE_DONUTS):
         return StarFit(DonutFlag.NO_DONUT | DonutFlag.OTHER_SIZE)
     if donut and is_hopeless(instrument.terms, search.best):
-        return StarFit(DonutFlag.UNDETERMINED)
+        lost = search.fitter.lost_light(search.start.stamp, search.best).any_pixel > _LOST
+        return StarFit(DonutFlag.MOSTLY_LOST if lost else DonutFlag.UNDETERMINED)
     sides, mirrored = None, None
     if donut and wavefront:
         sides, mirrored = _both_sides(search.fitter, search.start, search.best)
@@ -455,7 +456,7 @@ def _other_focus_is_better(fitter: StarFitter, start: Start, solution: Solution,
     if mirrored is None or misfit > _POOR:
         light = fitter.instrument.mirrored(fitter.light)
         mirrored_start = fitter.start_on(start.pixels, fitter.stamp(light, start.pixels))
-        mirrored = fitter.solve(mirrored_start.stamp, mirrored_start.unknowns, tolerance=COARSE)
+        mirrored = fitter.solve(mirrored_start.stamp, mirrored_start.unknowns, tolerance=COARSE, hopeless=solution.loss)
     return explains_more(mirrored, solution)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .image_model import FLUX, MOST_NEIGHBOURS, NEIGHBOUR, NUISANCES, RATIO, STRENGTH, X, Y, neighbours_of
-from .likelihood import Stamp, model_image
+from .likelihood import Stamp, linearized, model_image
 from .solve import COARSE, STEPS, Solution
 from .stamps import match_template, moved, plane_basis
 
@@ -21,14 +21,21 @@ _GAIN = 100.0
 _LEFT = 0.5
 #: Least part of the misfit by which a further neighbour lowers it in a search.
 _LOWERED = 0.1
-#: Loss a coarse pixel from which on neighbours are searched for around the star.
+#: Loss a coarse pixel from which on neighbours are searched for around the star; photons leave 0.1.
+_MISFIT = 0.15
+#: The same from which on they are tried without aberrations, too.
 _POOR = 1.0
 #: Loss a coarse pixel from which on stars are searched for without the wavefront of the first fit, too.
 _MISTAKEN = 3.0
-#: Distances of neighbours that overlap most of the star over the diameter of the donut.
+#: Distances of neighbours that overlap most of the star over the diameter of the donut, where they are tried.
 _NEAR_RADII = (0.08, 0.2)
-#: Directions from the star in which they are searched for.
-_NEAR_ANGLES = 6
+#: Distances and directions at which a score test looks for them, and the least part of the misfit that it promises: a
+#: neighbour has 0.024 to 1, since two equal stars are far from one, and turbulence at most 0.012.
+_SCORED_RADII = (0.05, 0.1, 0.2)
+_SCORED_ANGLES = 6
+_PROMISING = 0.015
+#: Directions in which they are tried: two stars of one flux are the same from either end.
+_NEAR_ANGLES = 3
 #: Steps from each of these places.
 _FIRST_STEPS = 4
 #: Steps with each neighbour before the next one is searched for.
@@ -78,11 +85,12 @@ class NeighbourSearch:
         """
         best = self._pruned(self._extended(single))
         if self._misfit(best) > _MISTAKEN:
-            templates = self._from_templates(np.zeros_like(single.shared), best.loss)
-            if templates is not None and templates.loss < best.loss:
+            lower = (1.0 - _LOWERED) * best.loss
+            templates = self._from_templates(np.zeros_like(single.shared), lower)
+            if templates is not None and templates.loss < lower:
                 trial = self._pruned(self._extended(templates))
                 best = trial if trial.loss < best.loss else best
-        if self._misfit(best) > _POOR:
+        if self._misfit(best) > _MISFIT:
             best = self._with_near_neighbour(best)
         if len(best.stars[0]) <= RATIO or not explains_more(best, single):
             return single
@@ -163,36 +171,84 @@ class NeighbourSearch:
         star[FLUX], star[[X, Y]] = max(fluxes[main], 1.0), places[main]
         others = [(fluxes[k] / star[FLUX], *(places[k] - places[main])) for k in kept[1:]]
         star = np.concatenate([star, *others])
-        return self.solve(stamp, star, nothing, COARSE, STEPS)
+        return self.solve(stamp, star, nothing, COARSE, STEPS, hopeless)
 
     def _with_near_neighbour(self, best: Solution) -> Solution:
         """Return the best solution with a neighbour that overlaps most of the star, if that explains much more.
 
-        A fit of one star takes two for one that is larger and oddly shaped, so that the residuals do not show where
-        the second stands: places around the first are tried, without aberrations.
+        A fit of one star takes two for one that is larger and oddly shaped. If a score test says that there may be two,
+        the second is tried where that puts it, then around the first, both without aberrations.
         """
-        others = neighbours_of(best.stars[0])
-        if len(others) == MOST_NEIGHBOURS:
+        if len(neighbours_of(best.stars[0])) == MOST_NEIGHBOURS:
+            return best
+        near = self._likeliest_near(best)
+        if near is None:
+            return best
+        trial = self.solve(self.stamp, _divided(best.stars[0], *near), best.shared, COARSE, STEPS, best.loss)
+        if _is_neighbour(trial, best):
+            return trial
+        if self._misfit(best) < _POOR:
             return best
         nothing, trials = np.zeros_like(best.shared), []
+        # The template stands in the middle of the two.
+        middle, others = self.first, neighbours_of(best.stars[0])
+        ratios = others[:, :1] * best.stars[0][FLUX] / middle[FLUX]
+        places = others[:, 1:] + best.stars[0][[X, Y]] - middle[[X, Y]]
+        middle = np.concatenate([middle, np.hstack([ratios, places]).ravel()])
         for radius in _NEAR_RADII:
-            for angle in np.arange(_NEAR_ANGLES) * 2.0 * np.pi / _NEAR_ANGLES:
+            for angle in np.arange(_NEAR_ANGLES) * np.pi / _NEAR_ANGLES:
                 offset = radius * self.diameter * np.array([np.cos(angle), np.sin(angle)])
-                star = self.first.copy()
-                star[FLUX] *= 0.5
-                # The template stands in the middle of the two.
-                star[[X, Y]] -= 0.5 * offset
-                ratios = others[:, :1] * best.stars[0][FLUX] / star[FLUX]
-                places = others[:, 1:] + best.stars[0][[X, Y]] - star[[X, Y]]
-                star = np.concatenate([star, [1.0], offset, np.hstack([ratios, places]).ravel()])
+                star = _divided(middle, 1.0, offset)
                 trials.append(self.solve(self.stamp, star, nothing, COARSE, _FIRST_STEPS, best.loss))
         # After a few steps the places that lead nowhere are known.
         for begun in sorted(trials, key=lambda trial: trial.loss)[:_FINISHED]:
             trial = begun if begun.loss > best.loss else self._finished(begun)
-            near = trial.stars[0][RATIO]
-            if explains_more(trial, best) and near > _LEAST_RATIO:
+            if _is_neighbour(trial, best):
                 best = trial
         return best
+
+    def _likeliest_near(self, best: Solution) -> tuple[float, np.ndarray] | None:
+        """Return flux over that of the star and place from it of a second star nearby, by a score test.
+
+        None where that promises no neighbour anywhere around. All else is free, the wavefront without its priors.
+        """
+        star = best.stars[0]
+        angles = np.arange(_SCORED_ANGLES) * 2.0 * np.pi / _SCORED_ANGLES
+        places = np.multiply.outer(_SCORED_RADII, np.stack([np.cos(angles), np.sin(angles)], axis=-1)).reshape(-1, 2)
+        places *= self.diameter
+        first, last = len(star), len(star) + len(NEIGHBOUR) * len(places)
+        added = np.column_stack([np.zeros(len(places)), places]).ravel()
+        point = linearized(self.stamp, np.concatenate([star, added]), best.waves[0])
+        if point is None:
+            return None
+        columns = point.columns * point.scales
+        ratios = columns[:, first : last : len(NEIGHBOUR)]
+        free = np.concatenate([columns[:, :first], columns[:, last:]], axis=1)
+        sizes = np.sqrt((free**2).sum(axis=0))
+        free = free[:, sizes > 0.0] / sizes[sizes > 0.0]
+        residuals = np.column_stack([ratios, point.pulls])
+        residuals = residuals - free @ np.linalg.lstsq(free, residuals, rcond=1e-6)[0]
+        slopes, curvatures = residuals[:, :-1].T @ residuals[:, -1], (residuals[:, :-1] ** 2).sum(axis=0)
+        gains = np.where(slopes > 0.0, slopes, 0.0) ** 2 / np.maximum(curvatures, 1e-300)
+        likeliest = int(np.argmax(gains))
+        if not gains[likeliest] > max(_GAIN, _PROMISING * best.loss):
+            return None
+        return min(float(slopes[likeliest] / curvatures[likeliest]), 1.0), places[likeliest]
+
+
+def _divided(star: np.ndarray, ratio: float, offset: np.ndarray) -> np.ndarray:
+    """Return unknowns of two stars of a flux ratio, an offset apart, with the light of one; its neighbours stay."""
+    divided, others = star[:RATIO].copy(), neighbours_of(star).copy()
+    divided[FLUX] /= 1.0 + ratio
+    divided[[X, Y]] -= (shift := ratio / (1.0 + ratio) * offset)
+    others[:, 0] *= 1.0 + ratio
+    others[:, 1:] += shift
+    return np.concatenate([divided, [ratio], offset, others.ravel()])
+
+
+def _is_neighbour(trial: Solution, best: Solution) -> bool:
+    """Return whether a solution with one more neighbour, its first, explains much more."""
+    return explains_more(trial, best) and bool(trial.stars[0][RATIO] > _LEAST_RATIO)
 
 
 def _central_first(solution: Solution) -> Solution:

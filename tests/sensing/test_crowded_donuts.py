@@ -120,6 +120,19 @@ def test_crowded_stars_are_as_good_as_alone(behind_focus):
     assert errors[0][~missed].max() < 2.0 * errors[1].max()
 
 
+@pytest.mark.long
+def test_stars_closer_than_the_seeing_are_told_apart(behind_focus):
+    """Two stars 1.2 arcsec apart, which one star with another wavefront fits nearly as well: it was 480 nm off."""
+    wave = wave_of(533, 260e-9)
+    canvas = Canvas(behind_focus, wave, rays=300)
+    image = canvas.at(0.0, 0.0) + 0.34 * canvas.at(0.0, -3.0)
+    fit = fitted(behind_focus, [noisy(image, SKY, 33)])
+    assert fit.reasons[0].startswith("blended")
+    # Flux and distance of the second make up for each other.
+    np.testing.assert_allclose(fit.companions[0, 0], [0.34, 0.0, -3.0], atol=0.3)
+    assert rss(fit.zernikes[0] - wave[3:]) < 100e-9
+
+
 def bad_stamps(clean, canvas):
     """Stamps by name, with the flags that they have for sure, and whether there are results."""
     rng, flag = np.random.default_rng(5), pachon.sensing.DonutFlag
