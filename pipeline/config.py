@@ -211,7 +211,7 @@ class AtmosphereConfig(Section):
     screen_length_m: Positive = Field(1300.0, description="side of a screen [m]")
     ground_lift_m: NotNegative = Field(0.0, description="height given to a layer on the ground [m]")
     zenith_angle_deg: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=80)] = Field(
-        0.0, description="angle of the telescope from the zenith [deg]"
+        0.0, description="angle of the telescope from the zenith, whose airmass dims stars [deg]"
     )
     zenith_position_angle_deg: Real | None = Field(
         None, description="of the zenith, from north through east [deg]; by default it lies towards the telescope's +x"

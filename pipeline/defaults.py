@@ -35,7 +35,7 @@ from .alignment_states import ENDINGS as STATE_ENDINGS
 from .alignment_states import with_active_optics_state
 from .config import BandName, Configuration, PsfConfig, ReconstructionConfig
 from .config_checks import WEIGHT_PIXELS, check_combinations
-from .photometry import band_of, pixel_angle, resolved_photometry
+from .photometry import airmass_of, band_of, pixel_angle, resolved_photometry
 from .resolved_values import resolved_value
 from .simulate.photometry import PROVISIONAL_FWHM, limiting_magnitude, saturation_magnitude
 from .simulate.screen_cover import check_screens, corner_fields
@@ -104,7 +104,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     site = _with_ground_wind(load_site(site_name), atmosphere.ground_wind_m_s)
     stars, light = config.stars, resolved_photometry(config.photometry, telescope, camera, band)
     if stars.catalogue is not None:
-        width, seconds, measured = PROVISIONAL_FWHM, atmosphere.exposure_s, band_of(band, light)
+        width, seconds, measured = PROVISIONAL_FWHM, atmosphere.exposure_s, band_of(band, light, airmass_of(atmosphere))
         stars = _with_defaults(
             stars.model_copy(update={"catalogue": _absolute_path(stars.catalogue, folder, (), STAR_ENDINGS)}),
             {

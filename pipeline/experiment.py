@@ -40,7 +40,7 @@ from ..wavefront.psf.engines import ENGINES
 from .config import Configuration, digest
 from .config_hash import hashed_content
 from .defaults import resolve
-from .photometry import band_of, lit_fraction_on_axis
+from .photometry import airmass_of, band_of, lit_fraction_on_axis
 from .resolved_values import resolved_value
 from .sensor.displacement import Displacement, EdgeRolloff, TreeRings
 from .simulate.screen_cover import check_samples, corner_fields
@@ -124,8 +124,8 @@ class Experiment:
 
     @cached_property
     def band(self) -> Band:
-        """Zero point, sky and noise of the camera in the band."""
-        return band_of(resolved_value(self.config.band), self.config.photometry)
+        """Zero point, sky and noise of the camera in the band, at the airmass of the exposure."""
+        return band_of(resolved_value(self.config.band), self.config.photometry, airmass_of(self.config.atmosphere))
 
     @cached_property
     def lit_fraction_on_axis(self) -> float:

@@ -18,6 +18,7 @@ from ..sky.visit_list.read_list import half_of_visit
 from ..sky.visit_list.visit_list import ListedVisit, VisitList
 from .config import Configuration, ListedVisitConfig, PointingConfig, configuration_of
 from .experiment import Experiment
+from .photometry import airmass_of
 from .resolved_values import resolved_value
 
 #: Names of cameras in headers; others have their own.
@@ -93,20 +94,16 @@ def ground_wind(visit: ListedVisit) -> tuple[float, float]:
 
 
 def visit_experiment(config: Configuration, visit: ListedVisit, folder: Path | None = None) -> Experiment:
-    """Return the experiment of a visit of a list, with the photometry of its airmass, sky and snaps.
+    """Return the experiment of a visit of a list, with the photometry of its sky and snaps.
 
-    What the list says counts more than the configuration. Stars are dimmed by the extinction of the airmass, the sky is
-    not: its brightness is that at the telescope. Snaps are one exposure of their total time, with the read noise of
-    all.
+    What the list says counts more than the configuration. The brightness of the sky is that at the telescope. Snaps are
+    one exposure of their total time, with the read noise of all.
     """
     with error_context(subject=visit.label):
         experiment = Experiment.from_config(visit_configuration(config, visit, folder), folder)
         settings = experiment.config
         band = experiment.band
-        airmass = 1.0 / math.sin(visit.altitude)
         updates = {
-            "zero_point": band.zero_point - band.extinction * (airmass - 1.0),
-            "extinction": band.extinction * airmass,
             "read_noise_e": band.read_noise * math.sqrt(visit.snaps),
             "full_well_e": band.full_well * visit.snaps,
         }
@@ -157,7 +154,6 @@ def visit_cards(experiment: Experiment, ccd: str) -> list[Card]:
     exposure = experiment.config.atmosphere.exposure_s
     start = visit.mid_mjd - float(half_of_visit(exposure, visit.snaps))
     pointing = resolved_value(experiment.config.pointing)
-    altitude = 0.5 * math.pi - math.radians(experiment.config.atmosphere.zenith_angle_deg)
     return [
         ("INSTRUME", instrument_of(experiment.camera), "camera"),
         ("DETECTOR", experiment.camera.ccd_index(ccd), "number of the CCD in the camera, from 0"),
@@ -170,7 +166,7 @@ def visit_cards(experiment: Experiment, ccd: str) -> list[Card]:
         ("RA", pointing.ra_deg % 360.0, "[deg] pointing, ICRS"),
         ("DEC", pointing.dec_deg, "[deg] pointing, ICRS"),
         ("ROTTELPO", experiment.config.rotator_deg, "[deg] camera against telescope (rotTelPos)"),
-        ("AIRMASS", 1.0 / math.sin(altitude), "secant of the zenith angle"),
+        ("AIRMASS", airmass_of(experiment.config.atmosphere), "secant of the zenith angle"),
         ("NSNAP", visit.snaps, "snaps of the visit"),
     ]
 

@@ -15,7 +15,7 @@ from ..models.camera.photometry import BANDS, Band
 from ..models.telescope import Telescope
 from ..raytrace.rays import field_direction
 from ..wavefront.chief_rays import image_jacobians
-from .config import BandName, PhotometryConfig
+from .config import AtmosphereConfig, BandName, PhotometryConfig
 
 #: Keys of the configuration and attributes of a band; pixels are in other units.
 _SAME = {
@@ -52,12 +52,18 @@ def resolved_photometry(
     return section.model_copy(update={key: values[key] for key in open_keys})
 
 
-def band_of(name: BandName, section: PhotometryConfig) -> Band:
-    """Return the band of a resolved section; ConfigError where it is not resolved."""
+def airmass_of(air: AtmosphereConfig) -> float:
+    """Return the secant of the zenith angle."""
+    return 1.0 / math.cos(math.radians(air.zenith_angle_deg))
+
+
+def band_of(name: BandName, section: PhotometryConfig, airmass: float = 1.0) -> Band:
+    """Return the band of a resolved section at an airmass; ConfigError where it is not resolved."""
     values = {attribute: getattr(section, key) for key, attribute in _SAME.items()}
     if section.pixel_arcsec is None or None in values.values():
         raise ConfigError("the configuration is not resolved")
-    return replace(BANDS[name], pixel_scale=section.pixel_arcsec * ARCSEC, **values)
+    band = replace(BANDS[name], pixel_scale=section.pixel_arcsec * ARCSEC, **values)
+    return band.at_airmass(airmass)
 
 
 def pixel_angle(telescope: Telescope, pixel_size: float) -> float:

@@ -51,6 +51,11 @@ class Band:
     gain: float = 1.0  #: electrons of one ADU
     source: str = "SMTN-002"  #: where the numbers are from
 
+    def at_airmass(self, airmass: float) -> Band:
+        """Return the band away from the zenith: stars are dimmed by the extinction, the sky at the telescope is not."""
+        dimmed = self.zero_point - self.extinction * (airmass - 1.0)
+        return replace(self, zero_point=dimmed, extinction=self.extinction * airmass)
+
 
 BANDS: dict[str, Band] = {
     band.name: band

@@ -129,7 +129,7 @@ def effective_time(experiment: Experiment, sigma: float, sky: float, zero_point:
     """Return the effective exposure time [s] by rms width [pixel], sky [adu] and zero point."""
     band, seconds = experiment.band, experiment.config.atmosphere.exposure_s
     nominal_sigma = _NOMINAL_FWHM[band.name] / FWHM_PER_RMS / (band.pixel_scale / ARCSEC)
-    # The configuration of a visit has the extinction of its airmass in both.
+    # The band of a visit has the extinction of its airmass in both.
     extinction = band.extinction / airmass
     nominal_zero_point = band.zero_point + extinction * (airmass - 1.0) - 2.5 * math.log10(band.gain)
     dark_sky = BANDS[band.name].dark_sky

@@ -5,6 +5,7 @@ import pytest
 
 import pachon
 from pachon.core.errors import PachonError
+from pachon.imaging.exposure import Exposure
 from pachon.models.camera.photometry import BANDS, estimated_band
 from pachon.pipeline.config import Configuration, configuration_of, with_options
 from pachon.pipeline.experiment import Experiment
@@ -64,6 +65,17 @@ def test_runs_take_the_photometry_of_their_camera(telescope, band, zero_point, r
     assert counts / np.sqrt(counts + pixels * (sky + read_noise**2 + found.dark_current)) == pytest.approx(30.0)
     assert sky == pytest.approx(sky_electrons_per_pixel(found, 1.0))
     assert stars.bright == saturation_magnitude(found, 1.0, 0.7 * ARCSEC)
+
+
+def test_stars_are_dimmed_by_their_airmass_and_the_sky_is_not():
+    air = SMALL["atmosphere"] | {"screen_length_m": 1600.0}
+    zenith, low = (run(atmosphere=air | {"zenith_angle_deg": angle}) for angle in (0.0, 60.0))
+    assert zenith.band.zero_point - low.band.zero_point == pytest.approx(0.13)  # SMTN-002, airmass 2
+    electrons = [Exposure.of_run(experiment).electrons(20.0) for experiment in (zenith, low)]
+    assert electrons[0] / electrons[1] == pytest.approx(10.0 ** (0.4 * 0.13))
+    assert sky_electrons_per_pixel(low.band, 1.0) == pytest.approx(sky_electrons_per_pixel(zenith.band, 1.0))
+    limits = [ccd_stars(experiment, experiment.config.ccds[0], 0.7 * ARCSEC).faint for experiment in (zenith, low)]
+    assert limits[0] - limits[1] == pytest.approx(0.13, abs=1e-9)
 
 
 def test_the_budget_of_the_lsst_is_drawn_for_the_lsst_alone():
