@@ -285,8 +285,10 @@ class _ExposureJob:
         )
 
     def _key(self, data: ShapeData, state: ExposureState | None, instrument: Instrument) -> str:
-        digest = hashlib.sha256()
-        for array in (data.values, data.noise, data.places.xy, data.places.ccd, self.heights):
+        digest, places = hashlib.sha256(), data.places
+        mean = np.zeros(0) if self.prior.mean is None else self.prior.mean.height(*places.xy.T)
+        terms = self.prior.common_terms(places), self.prior.ccd_polynomials(places)
+        for array in (data.values, data.noise, places.xy, places.ccd, self.heights, mean, *terms):
             digest.update(np.ascontiguousarray(array).tobytes())
         digest.update(repr((self.alignment_rms, instrument.key)).encode())
         if state is not None:

@@ -1,4 +1,5 @@
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,9 +35,10 @@ def fit_to(lsst_r, wavelengths):
 
     def of(exposures):
         def fit(which, telescope=instrument, **options):
-            stars, camera = [exposures[i].stars() for i in which], exposures[0].camera
-            aligned = OpticsPrior(alignment_rms=0.0)
-            return fit_static_heights(stars, telescope, camera=camera, prior=aligned, steps=STEPS, **options)
+            stars, aligned = [exposures[i].stars() for i in which], OpticsPrior(alignment_rms=0.0)
+            return fit_static_heights(
+                stars, telescope, **{"camera": exposures[0].camera, "prior": aligned, "steps": STEPS} | options
+            )
 
         return fit
 
@@ -120,7 +122,7 @@ def test_a_fit_goes_on_with_another_number_of_threads_of_blas(both, fit, monkeyp
 
 
 @pytest.mark.long
-def test_what_belongs_to_other_stars_or_is_damaged_is_computed_again(both, fit, monkeypatch, tmp_path):
+def test_what_belongs_to_other_stars_or_is_damaged_is_computed_again(both, fit, exposures, monkeypatch, tmp_path):
     folder = tmp_path / "copy"
     shutil.copytree(both[1], folder)
 
@@ -130,6 +132,9 @@ def test_what_belongs_to_other_stars_or_is_damaged_is_computed_again(both, fit, 
     monkeypatch.setattr(ExposureFit, "linearise", never)
     with pytest.raises(InterruptedError):
         fit([1, 0], folder=folder)
+    camera = exposures[0].camera
+    with pytest.raises(InterruptedError):
+        fit([0, 1], folder=folder, camera=replace(camera, placement=np.full((len(camera), 3), 1e-6)))
     (folder / "exposure_00000_step_0.npz").write_bytes(b"PK")
     with pytest.raises(InterruptedError):
         fit([0, 1], folder=folder)
