@@ -78,7 +78,7 @@ def _rim_amplitude(instrument: Instrument, star: StarSolution) -> _RimAmplitude 
     if instrument.known_seeing:
         scales[STRENGTH] = 0.0
     light_column, residual = point.over_noise(diffracted[..., None].astype(np.float32))[:, 0], point.pulls
-    prior, deviation = instrument.prior(light, unknowns, wave)
+    prior, deviation = instrument.prior(light, unknowns, wave, solution.prior_weight)
     curvature = columns.T @ columns * np.outer(scales, scales) + np.diag(prior)
     scale = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
     cross = scales * (columns.T @ light_column) / scale

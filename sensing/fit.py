@@ -325,7 +325,7 @@ def _fit_with_steps(fit: Callable[..., StarFit], star: ObservedStar, begun: Star
     """Fit one star, and again without steps between amplifiers where its residuals have any."""
     steps = _steps_of(begun)
     # They are no part of the search that another begins from.
-    before = None if begun is None else replace(begun, flags=begun.flags & ~DonutFlag.AMPLIFIER_STEP)
+    first = before = None if begun is None else replace(begun, flags=begun.flags & ~DonutFlag.AMPLIFIER_STEP)
     for _ in range(_STEP_FITS):
         fitted = fit(_without_steps(star, steps, before), before)
         usable = fitted.usable
@@ -334,6 +334,8 @@ def _fit_with_steps(fit: Callable[..., StarFit], star: ObservedStar, begun: Star
         middle = central_slices(star.image.shape, usable.full.image.shape)
         found = fit_steps(usable, [step.within(middle, fitted.unit) for step in steps])
         if found is None:
+            # What was taken off is no step after all.
+            fitted = fit(star, first) if steps else fitted
             break
         steps = tuple(step.around(middle, fitted.unit) for step in found.steps)
         found, before = replace(found, steps=steps), fitted

@@ -148,10 +148,15 @@ class Instrument:
         """Prior of the strengths of the turbulence; None where these are held."""
         return None if self.known_seeing else StrengthPrior(self.seeing.usual_strength)
 
-    def prior(self, light: StarLight, unknowns: np.ndarray, wave: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return inverse variances of the priors of a star's unknowns and its wavefront, and deviations from means."""
+    def prior(
+        self, light: StarLight, unknowns: np.ndarray, wave: np.ndarray, weight: float = 1.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return inverse variances of the priors of a star's unknowns and its wavefront, and deviations from means.
+
+        Those of the wavefront have a factor, the weight of a solution.
+        """
         count = len(unknowns)
-        precision = np.concatenate([np.zeros(count), self.terms.precision, light.shift_precision])
+        precision = np.concatenate([np.zeros(count), weight * self.terms.precision, light.shift_precision])
         deviation = np.concatenate([np.zeros(count), wave])
         deviation[len(deviation) - len(light.shift_mean) :] -= light.shift_mean
         if (of_strength := self.strength_prior) is not None:

@@ -224,7 +224,7 @@ def rim_gains(instrument: Instrument, fit: RimFit) -> tuple[list[RimBody], np.nd
     )
     first = len(star) + len(wave)
     fitted = np.flatnonzero(np.arange(first) != (STRENGTH if instrument.known_seeing else -1))
-    precision, deviation = instrument.prior(light, star, wave)
+    precision, deviation = instrument.prior(light, star, wave, fit.solution.prior_weight)
     inner = point.columns.T @ point.columns * np.outer(point.scales, point.scales) + np.diag(precision)
     inner = inner[np.ix_(fitted, fitted)]
     cross = (point.columns.T @ shadow_columns * np.outer(point.scales, scales))[fitted]

@@ -26,6 +26,13 @@ _NEAR = 1.0
 #: Part of what the model leaves beyond noise, or of noise itself if that is less, that a step is to explain: where it
 #: lacks much, its derivatives are not good enough for the last hundredth, and errors have what is left.
 _EXPLAINED = 1e-2
+#: Power of what a model lacks at the low frequencies of a wavefront, over its mean square: residuals are as wide as the
+#: seeing. Real donuts of DECam repeat alike for factors from 1 to 15.
+_SMOOTH = 4.0
+#: Largest weight of priors: those of real donuts are some hundreds.
+_MOST_WEIGHT = 1e3
+#: Change of the weight of priors below which a search keeps it.
+_SAME_WEIGHT = 1.2
 #: Damping of the first step, in units of the curvature.
 DAMPING = 1e-3
 #: Damping after a step whose gain is as predicted, over that before: where derivatives are not exact, that of the last
@@ -62,6 +69,8 @@ class Group:
         Largest distances of the shared unknowns from these means; infinite by default.
     strength_prior : StrengthPrior, optional
         Prior of the strengths of the turbulence, where these are not held; none by default.
+    weighted : int
+        Number of the first shared unknowns, against whose priors what the model leaves beyond noise counts as noise.
     """
 
     stamps: tuple[Stamp, ...]
@@ -72,6 +81,18 @@ class Group:
     prior_mean: np.ndarray | None = None
     limits: np.ndarray | None = None
     strength_prior: StrengthPrior | None = None
+    weighted: int = 0
+
+    def prior_weight(self, loss: float) -> float:
+        """Return the factor of these priors where the stamps have a loss: the power of residuals over that of noise."""
+        if not (self.weighted and np.isfinite(loss)):
+            return 1.0
+        return min(1.0 + _SMOOTH * max(loss / self.pixels - 1.0, 0.0), _MOST_WEIGHT)
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels in use."""
+        return sum(int(stamp.used.sum()) for stamp in self.stamps)
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -103,6 +124,8 @@ class Solution:
         Whether the last step was small enough.
     damping : float
         Damping of the first step of a search that goes on from here.
+    prior_weight : float
+        Factor of priors of the wavefront, by what the model lacks; the covariance is that of noise with these.
     """
 
     stars: tuple[np.ndarray, ...]
@@ -113,6 +136,7 @@ class Solution:
     loss: float
     converged: bool
     damping: float = DAMPING
+    prior_weight: float = 1.0
 
     def star_covariance(self, star: int) -> np.ndarray:
         """Return the covariance of the unknowns of one star."""
@@ -147,9 +171,11 @@ def solve(
     """
     joined = np.concatenate([*stars, shared])
     sizes = [len(s) for s in stars]
-    pixels = sum(int(stamp.used.sum()) for stamp in group.stamps)
+    pixels = group.pixels
     held = _held(group, sizes)
-    state = _linearize(group, joined, sizes, pool)
+    likelihood = _linearize(group, joined, sizes, pool)
+    weight = group.prior_weight(likelihood.loss)
+    state = _with_priors(group, joined, sizes, likelihood, weight)
     converged, predicted = False, np.inf
     for count in range(steps if np.isfinite(state.loss) else 0):
         step = np.zeros_like(joined)
@@ -167,12 +193,16 @@ def solve(
         if count and state.loss - predicted > hopeless:
             joined, state = trial, replace(state, loss=state.loss - predicted)
             break
-        trial_state = _linearize(group, trial, sizes, pool)
+        trial_likelihood = _linearize(group, trial, sizes, pool)
+        trial_state = _with_priors(group, trial, sizes, trial_likelihood, weight)
         if trial_state.loss < state.loss:
             gain = (state.loss - trial_state.loss) / predicted
             # Nielsen (1999): less where the gain is as predicted, more where it is less than half of that.
             damping *= max(_LESS, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
             joined, state = trial, trial_state
+            new_weight = group.prior_weight(trial_likelihood.loss)
+            if not weight / _SAME_WEIGHT < new_weight < weight * _SAME_WEIGHT:
+                state, weight = _with_priors(group, joined, sizes, trial_likelihood, new_weight), new_weight
         else:
             damping = 10.0 * max(damping, DAMPING)
             if damping > _LARGEST_DAMPING or predicted < _worth(state.loss, pixels):
@@ -186,7 +216,8 @@ def solve(
     star_unknowns = tuple(joined[a:b] for a, b in itertools.pairwise(bounds))
     best = joined[bounds[-1] :]
     waves = tuple(m @ best for m in group.maps)
-    return Solution(star_unknowns, best, waves, covariance, state.chi2, state.loss, converged, min(damping, DAMPING))
+    damping = min(damping, DAMPING)
+    return Solution(star_unknowns, best, waves, covariance, state.chi2, state.loss, converged, damping, weight)
 
 
 def _worth(loss: float, pixels: int) -> float:
@@ -211,7 +242,7 @@ def _held(group: Group, sizes: list[int]) -> np.ndarray:
 
 
 def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executor | None) -> _Linearized:
-    """Accumulate the normal equations of all stars and the prior."""
+    """Accumulate the normal equations of all stars."""
     bounds, n_star = np.cumsum([0, *sizes]), sum(sizes)
     shared = joined[n_star:]
 
@@ -227,10 +258,6 @@ def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executo
     apply: Callable[..., object] = map if pool is None else pool.map
     star_equations: list[NormalEquations] = list(apply(one, range(len(group.stamps))))  # type: ignore[call-overload]
     curvature, gradient = np.zeros((len(joined), len(joined))), np.zeros(len(joined))
-    # The prior has a likelihood of its own.
-    curvature[range(n_star, len(joined)), range(n_star, len(joined))] = group.precision
-    deviation = shared if group.prior_mean is None else shared - group.prior_mean
-    gradient[n_star:] = -group.precision * deviation
     for i, equations in enumerate(star_equations):
         star, size = slice(bounds[i], bounds[i + 1]), sizes[i]
         inner, cross, outer = (
@@ -244,7 +271,24 @@ def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executo
         curvature[n_star:, n_star:] += outer
         gradient[star] = equations.gradient[:size]
         gradient[n_star:] += group.maps[i].T @ equations.gradient[size:]
-    loss = sum(e.loss for e in star_equations) + float(group.precision @ deviation**2)
+    return _Linearized(
+        curvature, gradient, np.array([e.chi2 for e in star_equations]), sum(e.loss for e in star_equations)
+    )
+
+
+def _with_priors(
+    group: Group, joined: np.ndarray, sizes: list[int], likelihood: _Linearized, weight: float
+) -> _Linearized:
+    """Return normal equations with those of the priors, of which some have a factor."""
+    bounds, n_star = np.cumsum([0, *sizes]), sum(sizes)
+    curvature, gradient, loss = likelihood.curvature.copy(), likelihood.gradient.copy(), likelihood.loss
+    shared, unknowns = joined[n_star:], range(n_star, len(joined))
+    precision = group.precision.copy()
+    precision[: group.weighted] *= weight
+    curvature[unknowns, unknowns] += precision
+    deviation = shared if group.prior_mean is None else shared - group.prior_mean
+    gradient[n_star:] -= precision * deviation
+    loss += float(precision @ deviation**2)
     if group.strength_prior is not None:
         for at in bounds[:-1] + STRENGTH:
             precision = group.strength_prior.precision(joined[at])
@@ -254,7 +298,7 @@ def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executo
     if not (np.isfinite(loss) and np.isfinite(curvature).all() and np.isfinite(gradient).all()):
         # No step starts there, and none leads there.
         curvature, gradient, loss = np.zeros_like(curvature), np.zeros_like(gradient), np.inf
-    return _Linearized(curvature, gradient, np.array([e.chi2 for e in star_equations]), loss)
+    return replace(likelihood, curvature=curvature, gradient=gradient, loss=loss)
 
 
 def _pressed(group: Group, joined: np.ndarray, gradient: np.ndarray, sizes: list[int]) -> np.ndarray:

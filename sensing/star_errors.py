@@ -114,7 +114,7 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     point = linearized(star.stamp, solution.stars[0], solution.waves[0])
     if point is not None and len(solution.shared):
         beside = _TermsBeside(instrument, star, point)
-        precision, deviation = instrument.prior(star.light, solution.stars[0], solution.shared)
+        precision, deviation = instrument.prior(star.light, solution.stars[0], solution.shared, solution.prior_weight)
         power = residual_power(
             point,
             photons,
@@ -128,6 +128,7 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
         figure = beside.figure(photons)[wavefront, wavefront]
         # What a prior about zero takes from the telescope's further terms goes into those asked for.
         pulled = photons[wavefront, n_star : n_star + len(terms.figure)] * terms.precision * np.sqrt(terms.figure)
+        pulled *= solution.prior_weight
         by_prior = pulled @ pulled.T
         known_air = instrument.model.air.atmosphere is not None
         strength = 0.0 if known_air else min(power.strength, _most_air(instrument, float(solution.stars[0][STRENGTH])))
@@ -136,7 +137,8 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
             lacking, air = lacking + speckles[:n_star, :n_star], air + turbulence[wavefront, wavefront]
             speckled = speckles[wavefront, wavefront]
     accuracy, of_residuals = model_floor(solution.shared[:n]), residuals[wavefront, wavefront] + by_rivals(star, n)
-    of_noise = photons[wavefront, wavefront]
+    # Priors that weigh more than they say leave more of what they hold than the inverse of the curvature has.
+    of_noise = photons[wavefront, wavefront] + (1.0 - 1.0 / solution.prior_weight) * by_prior
     if star.steps is not None:
         lacking += star.steps.covariance[:n_star, :n_star]
         of_noise = of_noise + star.steps.covariance[wavefront, wavefront]

@@ -461,7 +461,9 @@ class StarFitter:
         n = self._map.shape[2]
         known = self.instrument.known_seeing
         mean, limits = self._mean[:n], self._limits[:n]
-        group = Group((stamp,), self._map, self.precision[:n], known, False, mean, limits, self._strength_prior)
+        # In smoothed pixels residuals are no noise of these.
+        count = 0 if stamp.grid.coarse else min(n, len(self.instrument.noll))
+        group = Group((stamp,), self._map, self.precision[:n], known, False, mean, limits, self._strength_prior, count)
         start = np.zeros(n) if shared is None else shared
         return solve(group, [star], start, tolerance=tolerance, steps=steps, hopeless=hopeless)
 

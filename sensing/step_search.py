@@ -34,6 +34,8 @@ _NARROWEST = 4
 _LEFT_OVER = 1e-3
 #: Largest standard deviation of the relative change of the gain: those of amplifiers are smaller.
 _VAGUE = 0.03
+#: Largest relative change of the gain: amplifiers of one CCD differ by less, and what differs by more is none.
+_MOST_GAIN = 0.3
 #: Most lines along which a stamp has steps, one across each axis: a corner of four amplifiers has two.
 _MOST = 2
 
@@ -50,11 +52,14 @@ def fit_steps(star: StarSolution, known: Sequence[AmplifierStep]) -> StepFit | N
     if not patterns:
         return None
     amplitudes, variances, moved = scores.amplitudes(patterns)
-    deviations = np.sqrt(np.diag(variances))
+    # Of patterns that are the same but for rounding nothing is known.
+    deviations = np.sqrt(np.maximum(np.diag(variances), 1e-300))
     steps = {(step.axis, step.first): step for step in kept}
     for pattern, amplitude, deviation in zip(patterns, amplitudes, deviations, strict=True):
         place = pattern.axis, pattern.first
         steps[place] = steps.get(place, AmplifierStep(*place)).changed(pattern.kind, float(amplitude), float(deviation))
+    if max(abs(step.sizes[1]) for step in steps.values()) > _MOST_GAIN:
+        return None
     change = float(np.abs(amplitudes / deviations).max()) if kept == list(known) else math.inf
     return StepFit(tuple(steps.values()), change, moved @ variances @ moved.T)
 
