@@ -153,7 +153,12 @@ def parabasal_optics(telescope: Telescope, wavelength: ArrayLike | None = None) 
     with np.errstate(divide="ignore"):
         focal_length = 1.0 / powers
     to_focus = _distances(height, turn, image_axes) if powers.any() else np.full(2, math.inf)
-    to_pupil = _distances(by_field, turn_by_field, image_axes)
+    if telescope.design_data.telecentric:
+        # Chief rays are parallel there, and light of the rim of the pupil comes from the point of the object.
+        slope = 1.0 / (telescope.object_distance - telescope.stop_z)
+        to_pupil, height, turn = to_focus, height + slope * by_field, turn + slope * turn_by_field
+    else:
+        to_pupil = _distances(by_field, turn_by_field, image_axes)
     diameters = [
         float(np.linalg.norm(axis @ (height + distance * turn))) if math.isfinite(distance) else math.inf
         for axis, distance in zip(image_axes.T, to_pupil, strict=True)

@@ -48,6 +48,15 @@ def test_on_an_axis_it_is_the_paraxial_trace(system):
         assert value == pytest.approx([expected] * 2, rel=1e-12)
 
 
+def test_parallel_chief_rays_cross_in_the_exit_pupil():
+    rows, stop_z, diameter = SYSTEMS["lens"]
+    lens = replace(telescope_of(rows, stop_z=stop_z, diameter=diameter), object_distance=stop_z + 3.0)
+    telecentric = lens.with_design(stop="s1", telecentric=True)
+    optics, paraxial = parabasal_optics(telecentric), first_order(telecentric)
+    assert optics.exit_pupil_distance == pytest.approx(optics.back_focus, rel=1e-12)
+    assert optics.exit_pupil_diameter == pytest.approx([paraxial.exit_pupil_diameter] * 2, rel=1e-12)
+
+
 def test_a_tilted_mirror_has_the_foci_of_coddington():
     """Of a sphere hit at the angle i, R cos(i) / 2 in the plane of incidence and R / (2 cos i) across it."""
     telescope = telescope_of([(0.0, 4.0, 0.0, None)], stop_z=0.5, diameter=0.1)
