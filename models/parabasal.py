@@ -207,11 +207,13 @@ def stop_center_point(telescope: Telescope, wavelength: float) -> np.ndarray:
         raise DomainError(f"{telescope.name}: expected a surface that is the stop (design data: stop)")
     count = telescope.surface_names.index(stop) + 1
     point = np.array(telescope.pupil_center, dtype=np.float64)
+    # Far from the axis of the telescope rounding is that of the coordinates.
+    size = max(telescope.pupil_diameter, *np.abs(telescope.surfaces[count - 1].vertex), *np.abs(point))
     for _ in range(_AIMING_STEPS):
         ray = _traced(telescope, wavelength, _axis_ray(telescope, point), count)[-1]
         at_stop = ray.within(telescope.surfaces[count - 1])
         missed = at_stop.place[:2]
-        if np.linalg.norm(missed) <= _AIMED * telescope.pupil_diameter:
+        if np.linalg.norm(missed) <= _AIMED * size:
             return point
         by_point = at_stop.moved[:2, :2]
         if not np.linalg.det(by_point):
