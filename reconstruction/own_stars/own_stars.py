@@ -43,8 +43,8 @@ DEFAULT_KIND = "kriging of pixels"
 FEWEST_STARS = 5
 #: Parts of the stars that are held out one after the other.
 FOLDS = 5
-# Beyond this distance from the centre, as a fraction of the side, a stamp is sky.
-_SKY = 0.4
+#: Beyond this distance from the centre, as a fraction of the side, a stamp is sky.
+SKY = 0.4
 # Rim of a stamp that a shift may bring in from the other side [pixel].
 _RIM = 2
 # Least side of a PSF [pixel].
@@ -134,7 +134,7 @@ def fit_own_stars(
         raise DomainError(f"size = {size}: expected an odd number of pixels from {limits}")
 
     def less_sky(bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        level, rms = sky_of_stamps(raw_images, bad, _SKY * side)
+        level, rms = sky_of_stamps(raw_images, bad, SKY * side)
         sky = np.nan_to_num(level)[:, None, None] if background else 0.0
         return np.where(bad, 0.0, raw_images - sky)[inner], rms
 
