@@ -90,7 +90,9 @@ def fit_own_stars(
     saturation : float, optional
         Level from which on a pixel is saturated; by default one at which three pixels of a star are equal.
     background : bool
-        Whether to subtract the median of the outer pixels of each stamp.
+        Whether to subtract the median of the outer pixels of each stamp. Wings go with it: at stamps of 6 FWHM the
+        adaptive T of a Kolmogorov or Moffat PSF falls by 0.3 to 0.5 %, at 10 FWHM by 0.05 %. Of stamps whose sky is
+        subtracted, False keeps them.
     masks : array of bool, optional
         [n, ny, nx], True for pixels to ignore, besides those that hold no light: not finite, or -1e29 or less (-1e30 of
         SExtractor), copies of dead columns (:func:`~pachon.measure.pixel_masks.copied_pixels`), and neighbours and
