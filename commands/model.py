@@ -64,7 +64,9 @@ def model_command(
         float | None,
         Option(help="Level from which on a pixel is saturated; by default one at which 3 pixels of a star are equal."),
     ] = None,
-    background: Annotated[bool, Option(help="Subtract the median of the outer pixels of each stamp.")] = True,
+    background: Annotated[
+        bool, Option(help="Subtract the median of the outer pixels of each stamp, wings of the PSF in it.")
+    ] = True,
     recipe: Recipe = None,
     basis: Basis = None,
     interpolation: Interpolation = None,

@@ -200,8 +200,9 @@ def measure_shapes(
 
 
 def fwhm(images: ArrayLike, pixel_scale: ArrayLike, *, upsampling: int = 8) -> np.ndarray:
-    """Measure the full width at half maximum of star images [rad], [n], pixel included; NaN without a positive maximum.
+    """Measure the full width at half maximum of star images [rad], [n], pixel included.
 
+    NaN without a positive maximum, and where a pixel has no weight (not finite, or -1e29 or less).
     Defined as the diameter of the circle with the area over which the image exceeds half its maximum. Image and maximum
     are those of the band-limited function through the pixels: Fourier interpolation on a grid finer by `upsampling`, a
     paraboloid through the highest node and its neighbours, and borders that count with the part of a fine pixel above
@@ -219,7 +220,7 @@ def fwhm(images: ArrayLike, pixel_scale: ArrayLike, *, upsampling: int = 8) -> n
     if upsampling < 2:
         raise DomainError(f"upsampling = {upsampling}: expected at least 2")
     result = np.full(len(stack), np.nan)
-    measured = np.flatnonzero(np.isfinite(stack).all(axis=(1, 2)))
+    measured = np.flatnonzero(~bad_pixels(stack).any(axis=(1, 2)))
     spans = _bright_spans(stack, measured)
     with one_blas_thread():
         for span in np.unique(spans, axis=0):

@@ -153,7 +153,12 @@ def parabasal_optics(telescope: Telescope, wavelength: ArrayLike | None = None) 
     with np.errstate(divide="ignore"):
         focal_length = 1.0 / powers
     to_focus = _distances(height, turn, image_axes) if powers.any() else np.full(2, math.inf)
-    to_pupil = _distances(by_field, turn_by_field, image_axes)
+    if telescope.design_data.telecentric:
+        # Chief rays are parallel there, and light of the rim of the pupil comes from the point of the object.
+        slope = 1.0 / (telescope.object_distance - telescope.stop_z)
+        to_pupil, height, turn = to_focus, height + slope * by_field, turn + slope * turn_by_field
+    else:
+        to_pupil = _distances(by_field, turn_by_field, image_axes)
     diameters = [
         float(np.linalg.norm(axis @ (height + distance * turn))) if math.isfinite(distance) else math.inf
         for axis, distance in zip(image_axes.T, to_pupil, strict=True)
@@ -202,11 +207,13 @@ def stop_center_point(telescope: Telescope, wavelength: float) -> np.ndarray:
         raise DomainError(f"{telescope.name}: expected a surface that is the stop (design data: stop)")
     count = telescope.surface_names.index(stop) + 1
     point = np.array(telescope.pupil_center, dtype=np.float64)
+    # Far from the axis of the telescope rounding is that of the coordinates.
+    size = max(telescope.pupil_diameter, *np.abs(telescope.surfaces[count - 1].vertex), *np.abs(point))
     for _ in range(_AIMING_STEPS):
         ray = _traced(telescope, wavelength, _axis_ray(telescope, point), count)[-1]
         at_stop = ray.within(telescope.surfaces[count - 1])
         missed = at_stop.place[:2]
-        if np.linalg.norm(missed) <= _AIMED * telescope.pupil_diameter:
+        if np.linalg.norm(missed) <= _AIMED * size:
             return point
         by_point = at_stop.moved[:2, :2]
         if not np.linalg.det(by_point):

@@ -107,7 +107,8 @@ def galaxies_of_sky_catalogue(columns: Mapping[str, Any], path: Path, pointing: 
 def galaxies_of_instance_catalogue(path: Path, pointing: Any) -> Galaxies:
     """Return the galaxies of an instance catalogue and of those that it includes; stars are left out.
 
-    Magnitudes are those of the catalogue, AB at 500 nm, as of flat spectra. Each component is a galaxy by itself.
+    Magnitudes are those of the catalogue, AB at 500 nm, as of flat spectra. As in imSim, which sets the flux of an
+    object after it is lensed, they are not magnified. Each component is a galaxy by itself.
 
     Raises
     ------
@@ -138,9 +139,8 @@ def galaxies_of_instance_catalogue(path: Path, pointing: Any) -> Galaxies:
     # phosim's shear has the other sign of gamma2.
     radius, e = _lensed(np.sqrt(a * b) * ARCSEC, ellipticity, gamma1 - 1j * gamma2, kappa)
     xi, eta = tangent_plane(np.deg2rad(ra), np.deg2rad(dec), pointing)
-    magnified = magnitude - 2.5 * np.log10(_magnification(gamma1 - 1j * gamma2, kappa))
     sersic = np.where(knots > 0.0, 1.0, np.clip(index, LEAST_INDEX, GREATEST_INDEX))
-    return Galaxies.single(xi, eta, magnified, radius, e1=e.real, e2=-e.imag, sersic=sersic)
+    return Galaxies.single(xi, eta, magnitude, radius, e1=e.real, e2=-e.imag, sersic=sersic)
 
 
 def _lensed(

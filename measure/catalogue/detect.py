@@ -29,10 +29,11 @@ _KRON_FACTOR = 2.5
 _KRON_LEAST = 3.5
 # The window of centroids has the half-light radius of the object as its HWHM.
 _WINDOW = 2.0 / 2.35
-# Side of the stamps on which widths at half maximum are measured [pixel].
-_FWHM_SIDE = 25
-# Stamps that are measured at a time, which bounds their memory.
-_FWHM_BATCH = 2048
+# Sides of the stamps on which widths at half maximum are measured [pixel]: the first that is three half-light radii.
+_FWHM_SIDES = (25, 51, 101, 201, 401)
+_FWHM_RADII = 3.0
+# Pixels of the stamps that are measured at a time, which bounds their memory.
+_FWHM_PIXELS = 2048 * 25**2
 # Room of SEP for pixels above the threshold, as a fraction of the image: its own does not grow with one.
 _PIXEL_ROOM = 0.2
 #: Most levels of brightness by which blends are taken apart: SEP goes through all of them for every object.
@@ -199,7 +200,7 @@ def _measure_objects(
         flux=flux,
         flux_error=flux_error,
         half_light_radius=radius,
-        fwhm=_measure_fwhm(data, segmentation, x, y),
+        fwhm=_measure_fwhm(data, segmentation, x, y, radius),
         a=a,
         b=b,
         theta=theta,
@@ -211,17 +212,26 @@ def _measure_objects(
     )
 
 
-def _measure_fwhm(data: np.ndarray, segmentation: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the full widths at half maximum [pixel], with neighbours set to zero; NaN without a positive peak."""
-    result = []
-    for i in range(0, len(x), _FWHM_BATCH):
-        batch = slice(i, i + _FWHM_BATCH)
-        stamps = cut_out(data, x[batch], y[batch], _FWHM_SIDE, 0.0)
-        labels = cut_out(segmentation, x[batch], y[batch], _FWHM_SIDE, 0)
-        object_labels = np.arange(i + 1, i + 1 + len(stamps))[:, None, None]
-        stamps[(labels != 0) & (labels != object_labels)] = 0.0
-        result.append(fwhm(stamps, 1.0))
-    return np.concatenate(result)
+def _measure_fwhm(
+    data: np.ndarray, segmentation: np.ndarray, x: np.ndarray, y: np.ndarray, radius: np.ndarray
+) -> np.ndarray:
+    """Return the full widths at half maximum [pixel] of objects, with neighbours set to zero.
+
+    `radius` are their half-light radii [pixel], NaN where unknown. NaN without a positive peak, and of an object that
+    is wider than the largest stamp.
+    """
+    result = np.full(len(x), np.nan)
+    choice = np.searchsorted(_FWHM_SIDES, _FWHM_RADII * np.nan_to_num(radius))
+    for k, side in enumerate(_FWHM_SIDES):
+        members = np.flatnonzero(choice == k)
+        size = max(1, _FWHM_PIXELS // side**2)
+        for i in range(0, len(members), size):
+            batch = members[i : i + size]
+            stamps = cut_out(data, x[batch], y[batch], side, 0.0)
+            labels = cut_out(segmentation, x[batch], y[batch], side, 0)
+            stamps[(labels != 0) & (labels != batch[:, None, None] + 1)] = 0.0
+            result[batch] = fwhm(stamps, 1.0)
+    return result
 
 
 def _neighbour_distance(x: np.ndarray, y: np.ndarray) -> np.ndarray:

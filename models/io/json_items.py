@@ -14,6 +14,8 @@ from .lens.source import Findings, Source
 
 #: Longest file [byte]: grids of sag take megabytes.
 MAX_BYTES = 50_000_000
+#: Most digits of a whole number that floats can hold.
+_MOST_DIGITS = 300
 
 
 class JsonObject:
@@ -31,7 +33,7 @@ class JsonObject:
         """Return the object that a file holds; PrescriptionError if it is no JSON."""
         raw = read_bytes(path, PrescriptionError, max_bytes=MAX_BYTES)
         try:
-            content = json.loads(raw)
+            content = json.loads(raw, parse_int=_whole_number)
         except (ValueError, RecursionError) as error:
             raise PrescriptionError(f"not a JSON file ({error})", file=path) from None
         if not isinstance(content, dict):
@@ -133,3 +135,8 @@ class JsonObject:
             if key not in understood_keys and value not in (None, [], {}):
                 text = f"{shown(key)} = {shown(value)}: this key is not understood"
                 findings.report(self.problem(text))
+
+
+def _whole_number(text: str) -> int | float:
+    """Return a number without point or exponent, like others infinite where floats cannot hold it."""
+    return int(text) if len(text) <= _MOST_DIGITS else float(text)

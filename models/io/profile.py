@@ -50,15 +50,13 @@ class Profile:
         """Return the profile of a shape [m] for a unit of length [m]; PrescriptionError if it is none of these."""
         parts = list(shape.parts) if isinstance(shape, Sum) else [shape]
         even: dict[int, float] = {}
-        terms: list[tuple[int, int, float]] = []
+        polynomial: dict[tuple[int, int], float] = {}
         base = cls(0.0, 0.0)
         curved_count = 0
         for shape_part in parts:
             if isinstance(shape_part, XYPolynomial):
-                radial = _radial(shape_part.terms)
-                terms += () if radial is not None else shape_part.terms
-                for power, a in (radial or {}).items():
-                    even[power] = even.get(power, 0.0) + a * unit ** (power - 1)
+                for i, j, a in shape_part.terms:
+                    polynomial[i, j] = polynomial.get((i, j), 0.0) + a
             elif isinstance(shape_part, Plane | Sphere | Conic | EvenAsphere):
                 base, curved_count = (
                     cls(shape_part.curvature * unit, shape_part.conic),
@@ -78,6 +76,12 @@ class Profile:
                 raise PrescriptionError(
                     f"shape {type(shape_part).__name__}: expected a conic with powers of r or of x and y"
                 )
+        terms = tuple((i, j, a) for (i, j), a in polynomial.items())
+        radial = _radial(terms)
+        if radial is not None:
+            terms = ()
+            for power, a in radial.items():
+                even[power] = even.get(power, 0.0) + a * unit ** (power - 1)
         special = bool(base.odd) or base.curvature_x is not None
         if curved_count > 1 or (special and (even or terms)) or (any(even.values()) and terms):
             kinds = ", ".join(type(shape_part).__name__ for shape_part in parts)

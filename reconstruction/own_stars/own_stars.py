@@ -43,8 +43,8 @@ DEFAULT_KIND = "kriging of pixels"
 FEWEST_STARS = 5
 #: Parts of the stars that are held out one after the other.
 FOLDS = 5
-# Beyond this distance from the centre, as a fraction of the side, a stamp is sky.
-_SKY = 0.4
+#: Beyond this distance from the centre, as a fraction of the side, a stamp is sky.
+SKY = 0.4
 # Rim of a stamp that a shift may bring in from the other side [pixel].
 _RIM = 2
 # Least side of a PSF [pixel].
@@ -90,7 +90,9 @@ def fit_own_stars(
     saturation : float, optional
         Level from which on a pixel is saturated; by default one at which three pixels of a star are equal.
     background : bool
-        Whether to subtract the median of the outer pixels of each stamp.
+        Whether to subtract the median of the outer pixels of each stamp. Wings go with it: at stamps of 6 FWHM the
+        adaptive T of a Kolmogorov or Moffat PSF falls by 0.3 to 0.5 %, at 10 FWHM by 0.05 %. Of stamps whose sky is
+        subtracted, False keeps them.
     masks : array of bool, optional
         [n, ny, nx], True for pixels to ignore, besides those that hold no light: not finite, or -1e29 or less (-1e30 of
         SExtractor), copies of dead columns (:func:`~pachon.measure.pixel_masks.copied_pixels`), and neighbours and
@@ -134,7 +136,7 @@ def fit_own_stars(
         raise DomainError(f"size = {size}: expected an odd number of pixels from {limits}")
 
     def less_sky(bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        level, rms = sky_of_stamps(raw_images, bad, _SKY * side)
+        level, rms = sky_of_stamps(raw_images, bad, SKY * side)
         sky = np.nan_to_num(level)[:, None, None] if background else 0.0
         return np.where(bad, 0.0, raw_images - sky)[inner], rms
 

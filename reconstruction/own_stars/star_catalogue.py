@@ -211,7 +211,10 @@ def load_stars(
             values = columns[name]
             quality[kind] = _checked_column(path, name, values.astype(np.uint8) if values.dtype == bool else values, 3)
         else:
-            quality[kind] = None if cube is None else _cube_named(cube_hdus, (kind, *OTHER_NAMES[kind]))
+            image = None if cube is None else _image_named(cube_hdus, (kind, *OTHER_NAMES[kind]))
+            quality[kind] = None if image is None else np.asarray(image.data, dtype=np.float64)
+            if image is not None and kind == "mask":
+                header = image.header
     return StarCutouts(
         without_weightless(
             stamps,
@@ -288,11 +291,11 @@ def _first_cube(hdus: fits.HDUList | None) -> np.ndarray | None:
     return None
 
 
-def _cube_named(hdus: fits.HDUList | None, names: Iterable[str]) -> np.ndarray | None:
+def _image_named(hdus: fits.HDUList | None, names: Iterable[str]) -> fits.ImageHDU | None:
     """Return the image of three axes with one of these extension names, or None."""
     for hdu in hdus or ():
         if hdu.is_image and hdu.data is not None and hdu.data.ndim == 3 and hdu.name.lower() in names:
-            return np.asarray(hdu.data, dtype=np.float64)
+            return hdu
     return None
 
 

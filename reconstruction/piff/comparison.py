@@ -23,7 +23,8 @@ from ...core.units import ARCSEC, pure_numbers
 from ...measure.correlation_plots import correlation_columns, draw_rho, rho_plot
 from ...measure.rho_statistics import RhoStatistics, trace_of_moments
 from ...measure.shapes import Shapes, measure_shapes
-from ..own_stars.own_stars import FEWEST_STARS, fit_own_stars
+from ..own_stars.masked_stars import as_bad_pixels, sky_of_stamps
+from ..own_stars.own_stars import FEWEST_STARS, SKY, fit_own_stars
 from ..own_stars.result import OwnStars, part_of, star_rho_statistics
 from ..psf_model.colour import as_colours
 from ..psf_model.polynomial import as_positions
@@ -108,7 +109,8 @@ def compare_with_piff(
 
     Ours predicts each star from others (:func:`~pachon.fit_own_stars`). Piff's fit has seen all stars that it did not
     reserve, so its residuals there are too small. Where five or more of the stars are not of its fit, those rows are
-    the fair ones: there ours is made of the stars of Piff's fit alone.
+    the fair ones: there ours is made of the stars of Piff's fit alone. Where the sky of the stars is subtracted, images
+    of Piff lose the same part of their wings.
 
     Parameters
     ----------
@@ -139,7 +141,11 @@ def compare_with_piff(
     pachon_stars = fit_own_stars(stamps, places, scale, masks=masks, **options)
     used = pachon_stars.used
     star_properties = {key: pure_numbers(values, key)[used] for key, values in (properties or {}).items()}
-    images = psf.at(places[used], chip=chip, size=pachon_stars.stamps.shape[1], properties=star_properties)
+    raw_images = np.asarray(stamps, dtype=np.float64)
+    drawn = psf.at(places[used], chip=chip, size=max(raw_images.shape[1:]), properties=star_properties)
+    if options.get("background", True):
+        drawn = _less_sky(drawn, as_bad_pixels(raw_images, masks)[used])
+    images = _middle(drawn, 2 * (pachon_stars.stamps.shape[1],))
     shapes, held_out, theirs = (
         part_of(pachon_stars.shapes, used),
         part_of(pachon_stars.held_out, used),
@@ -167,6 +173,21 @@ def compare_with_piff(
         _models(shapes, rows),
         {name: _rho(pachon_stars, shapes, model, star_mask, bins) for name, model, star_mask in rows},
     )
+
+
+def _less_sky(drawn: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Return images [n, size, size] less what :func:`~pachon.fit_own_stars` takes for the sky of stamps [n, ny, nx].
+
+    Part of it are the wings of the PSF.
+    """
+    level, _ = sky_of_stamps(_middle(drawn, bad.shape[1:]), bad, SKY * min(bad.shape[1:]))
+    return drawn - np.nan_to_num(level)[:, None, None]
+
+
+def _middle(images: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return parts of a shape (ny, nx) of images [n, size, size] about their middle pixels."""
+    first_row, first_column = (images.shape[1] // 2 - count // 2 for count in shape)
+    return images[:, first_row : first_row + shape[0], first_column : first_column + shape[1]]
 
 
 def _colours(options: Mapping[str, Any], count: int) -> np.ndarray | None:

@@ -199,6 +199,12 @@ def test_fwhm_without_a_maximum():
     assert np.isnan(fwhm(images, PIXEL)).tolist() == [True, True, False]
 
 
+def test_fwhm_of_masked_pixels():
+    images = np.repeat(gaussian(21, COVARIANCE, (0.0, 0.0)).reshape(1, 21, 21), 3, axis=0)
+    images[1, 2, 3], images[2, 2, 3] = -1e30, np.nan
+    assert np.isnan(fwhm(images, 1.0)).tolist() == [False, True, True]
+
+
 def test_bad_arguments():
     image = gaussian(31)
     for scale in (0.0, -1.0, np.nan, np.array([1.0, 2.0])):

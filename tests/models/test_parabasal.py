@@ -11,7 +11,7 @@ import pachon
 from pachon.core.errors import DomainError
 from pachon.models.first_order import first_order
 from pachon.models.grating import Grating
-from pachon.models.parabasal import parabasal_optics
+from pachon.models.parabasal import parabasal_optics, stop_center_point
 from pachon.models.shapes.freeform import Biconic, Toroid
 from pachon.models.shapes.polynomial import XYPolynomial
 from pachon.models.shapes.shape import Conic, Plane, Sphere
@@ -46,6 +46,27 @@ def test_on_an_axis_it_is_the_paraxial_trace(system):
         (optics.exit_pupil_diameter, paraxial.exit_pupil_diameter),
     ):
         assert value == pytest.approx([expected] * 2, rel=1e-12)
+
+
+def test_parallel_chief_rays_cross_in_the_exit_pupil():
+    rows, stop_z, diameter = SYSTEMS["lens"]
+    lens = replace(telescope_of(rows, stop_z=stop_z, diameter=diameter), object_distance=stop_z + 3.0)
+    telecentric = lens.with_design(stop="s1", telecentric=True)
+    optics, paraxial = parabasal_optics(telecentric), first_order(telecentric)
+    assert optics.exit_pupil_distance == pytest.approx(optics.back_focus, rel=1e-12)
+    assert optics.exit_pupil_diameter == pytest.approx([paraxial.exit_pupil_diameter] * 2, rel=1e-12)
+
+
+def test_a_stop_far_from_the_axis_is_met_in_its_middle():
+    """Rounding is that of metres, in a beam of a millimetre."""
+    mirror = telescope_of([(0.0, 4.0, -1.0, None)], stop_z=1.0, diameter=1e-3)
+    stop = Surface("stop", Interaction.PASS, Plane(), (0.0, 0.0, 0.8), VACUUM)
+    for height in np.linspace(1.5, 2.5, 20):
+        # A paraboloid sends the ray at 2 m, where it is 0.5 m high, through its focus at 2 m.
+        placed = replace(stop, vertex=(0.0, float(height) * (2.0 - 0.8) / (2.0 - height**2 / 8.0), 0.8))
+        telescope = replace(mirror, surfaces=(mirror.surfaces[0], placed), pupil_center=(0.0, 2.0))
+        x, y = stop_center_point(telescope.with_design(stop="stop"), telescope.default_wavelength)
+        assert (x, y) == pytest.approx((0.0, height), abs=1e-14)
 
 
 def test_a_tilted_mirror_has_the_foci_of_coddington():

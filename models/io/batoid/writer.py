@@ -67,7 +67,7 @@ def telescope_to_batoid(telescope: Telescope) -> str:
             "items": _items(t, nested, 0, len(t.surfaces), (np.zeros(3), np.eye(3))),
         }
         content = {ROOT: system, "pachon": _extras(t, [name for name in t.groups if name not in nested])}
-    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
+    return yaml.safe_dump(_plain(content), sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
 
 
 def _nested_groups(t: Telescope) -> dict[str, tuple[int, int]]:
@@ -144,7 +144,7 @@ def _extras(t: Telescope, groups: list[str]) -> dict[str, Any]:
             name: {"surfaces": list(t.groups[name]), "pivot": list(pivot), "rotation": [list(row) for row in axes]}
             for name, (pivot, axes) in frames.items()
         },
-        "design": _plain(design_items(t.design_data)),
+        "design": design_items(t.design_data),
         "semi_diameters": {s.name: s.semi_diameter for s in t.surfaces if s.semi_diameter is not None},
         "coatings": {name: coating_items(coating) for coating, name in coated.items()},
         "coated": {s.name: coated[s.coating] for s in t.surfaces if s.coating is not None},
@@ -153,7 +153,7 @@ def _extras(t: Telescope, groups: list[str]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Return lists, mappings and numbers as YAML's safe dumper takes them, without marks of units."""
+    """Return lists, mappings and numbers as YAML's safe dumper takes them, without marks of units or of NumPy."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

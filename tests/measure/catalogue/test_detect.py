@@ -51,6 +51,14 @@ def test_positions_fluxes_and_sizes_of_gaussians(found):
     assert (found.flags == 0).all()
 
 
+@pytest.mark.parametrize("sigma", [1.5, 12.0, 20.0, 35.0])
+def test_widths_of_small_and_large_objects(sigma):
+    image = gaussian(200.3, 199.6, 1e7, sigma, sigma, side=400)
+    noise = np.random.default_rng(2).normal(0.0, NOISE, image.shape)
+    objects = pachon.detect_objects(image + noise, np.full_like(image, NOISE**2), background_size=None)
+    np.testing.assert_allclose(objects.fwhm[objects.flux.argmax()], np.sqrt(8.0 * np.log(2.0)) * sigma, rtol=5e-3)
+
+
 def test_flux_errors_are_those_of_the_aperture():
     # Twenty images: the scatter of a flux is known to 16 %.
     catalogues = [pachon.detect_objects(image_of(seed=s), VARIANCE, background_size=None) for s in range(20)]

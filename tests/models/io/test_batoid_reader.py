@@ -217,3 +217,9 @@ def test_groups_that_are_no_neighbours_or_overlap_are_kept_beside(lsst_r, tmp_pa
     content = yaml.safe_load((tmp_path / "out.yaml").read_text())
     assert [item["name"] for item in content["opticalSystem"]["items"]][:2] == ["first", "M3"]
     assert list(content["pachon"]["groups"]) == ["mirrors", "second"]
+
+
+def test_numbers_of_numpy_are_written_as_plain_ones(lsst_r, tmp_path):
+    telescope = replace(lsst_r, field_limit=np.deg2rad(2.0), stop_z=np.float64(0.5), pupil_diameter=np.float64(8.0))
+    save_telescope(telescope, tmp_path / "out.yaml", format="batoid")
+    assert load_telescope(tmp_path / "out.yaml") == telescope

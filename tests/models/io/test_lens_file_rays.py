@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -209,6 +210,16 @@ def test_files_that_are_no_json(tmp_path):
         path.write_text(content)
         with pytest.raises(PrescriptionError, match=expected):
             pachon.load_telescope(path)
+
+
+@pytest.mark.parametrize("ending", ["json", "roa"])
+def test_whole_numbers_that_no_float_holds_are_named(tmp_path, ending):
+    path = tmp_path / f"lens.{ending}"
+    pachon.save_telescope(pachon.new_telescope("doublet"), path)
+    key = {"json": "rx", "roa": "cv"}[ending]
+    path.write_text(re.sub(f'"{key}": [-.\\de]+', f'"{key}": 1{"0" * 400}', path.read_text()))
+    with pytest.raises(PrescriptionError, match=f"{key} = .*: expected a finite number"):
+        pachon.load_telescope(path)
 
 
 @pytest.mark.parametrize("name", ["lsst_v3.3_r", "paul_baker", "freeforms.json"])

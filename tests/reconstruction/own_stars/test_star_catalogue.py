@@ -159,6 +159,21 @@ def test_cubes_of_weights_and_planes_of_masks(tmp_path):
         load_stars(tmp_path / "planes.fits")
 
 
+@pytest.mark.parametrize("apart", [False, True])
+def test_image_of_masks_has_its_planes_in_its_own_header(tmp_path, apart):
+    stamps, positions = stars()
+    bad = bad_pixels(len(stamps))
+    detected = np.hypot(*(np.mgrid[:9, :11] - np.array([4, 5])[:, None, None])) < 3.0
+    masks = fits.ImageHDU((np.where(bad, 1 << 3, 0) | np.where(detected, 1 << 5, 0)).astype(np.int32), name="MASK")
+    masks.header.update({"MP_CR": 3, "HIERARCH MP_DETECTED": 5})
+    table = fits.table_to_hdu(Table({"x": positions[:, 0], "y": positions[:, 1]}))
+    images = [fits.ImageHDU(stamps, name="STAMPS"), masks]
+    fits.HDUList([fits.PrimaryHDU(), table, *([] if apart else images)]).writeto(tmp_path / "stars.fits")
+    fits.HDUList([fits.PrimaryHDU(), *images]).writeto(tmp_path / "stamps.fits")
+    loaded = load_stars(tmp_path / "stars.fits", images=tmp_path / "stamps.fits" if apart else None).stamps
+    np.testing.assert_array_equal(loaded, np.where(bad, np.nan, stamps))
+
+
 def test_files_of_lsst_stamps(tmp_path):
     stamps, _ = stars()
     bad = bad_pixels(len(stamps))

@@ -118,3 +118,13 @@ def test_stars_have_their_colours_in_every_model(psf, stars):
 def test_a_missing_chip_is_named(stars):
     with pytest.raises(DomainError, match="chip = None: expected one of 1, 2"):
         pachon.reconstruction.compare_with_piff(pachon.load_piff(DATA / "grid_chips.piff"), *stars[:2])
+
+
+def test_wings_that_go_with_the_sky_of_stars_go_from_images_of_piff_too():
+    psf = pachon.load_piff(DATA / "moffat.piff")
+    places = np.stack([psf.stars["x"], psf.stars["y"]], axis=1)
+    stamps = 1e5 * psf.at(places, size=15) + np.random.default_rng(1).normal(0.0, 1.0, (len(places), 15, 15))
+    for background in (True, False):
+        found = pachon.reconstruction.compare_with_piff(psf, stamps, places, background=background, bins=2)
+        # Kept in Piff's images alone, the wings made T of stars 1 % smaller.
+        assert abs(found.summary()["Piff, stars of its fit"]["mean_dt"]) < 2e-4
