@@ -13,6 +13,7 @@ from pachon.models.obstruction import Obstruction
 from pachon.models.shapes.shape import Plane
 from pachon.models.surface import Interaction, Surface
 from pachon.wavefront.atmosphere.turbulence import diffraction_otf, structure_function
+from pachon.wavefront.psf.clear_pupil import lit_fractions
 from pachon.wavefront.psf.engine import PsfInputs, Stars
 from pachon.wavefront.psf.image_plane import ImagePlane
 from pachon.wavefront.psf.lattice_pupil import FEWEST_POINTS, LatticeTransfer
@@ -223,6 +224,23 @@ def test_vanes_and_solids_are_served(lsst_r):
         found = make_psfs(telescope, star, 620e-9, atmosphere=air(), engine="long_exposure")
         assert 0.9 * plain.lit_fraction < found.lit_fraction < plain.lit_fraction - least
         assert found.inside == pytest.approx(plain.inside, abs=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("aperture", "lit"),
+    [
+        (Complement(Circle(0.5, x=3.4)), 1.0 - 0.5**2 / (4.18**2 - 2.558**2)),
+        (Circle(0.6, x=-2.0, y=2.6), 0.6**2 / (4.18**2 - 2.558**2)),
+    ],
+)
+def test_discs_beside_the_axis(lsst_r, aperture, lit):
+    """No spoke of a few tens is one clear piece there, or meets them."""
+    plane = Surface("mask", Interaction.PASS, Plane(), (0.0, 0.0, 9.0), lsst_r.medium_before, aperture)
+    telescope = replace(lsst_r, surfaces=(plane, *lsst_r.surfaces))
+    found = make_psfs(telescope, np.zeros((1, 2)), 620e-9, atmosphere=air(), engine="long_exposure")
+    assert found.lit_fraction == pytest.approx(lit, abs=1e-3)
+    # Of a thousand rays.
+    assert lit_fractions(telescope, np.array([[0.0, 0.0, -1.0]]), 620e-9) == pytest.approx(lit, abs=3e-3)
 
 
 def test_donuts_of_a_telescope_with_vanes():
