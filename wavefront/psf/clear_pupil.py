@@ -56,7 +56,8 @@ class SpokePupil:
 
         They stand on so many rings, by default as far apart as the spokes are.
         """
-        require_count(count, "n_pupil", 10)
+        if rings is None:
+            require_count(count, "n_pupil", 10)
         n_ring = rings or min(math.ceil(math.sqrt(count / _SPOKES_PER_RING)), MOST_RINGS)
         n_spoke = 4 * max(1, round(count / (4 * n_ring)))
         legendre = np.polynomial.legendre.Legendre.basis(n_ring - 1)
