@@ -143,14 +143,12 @@ def trace_pupils(
 
     chief = reference_rays(request, request.middle, focal_plane)
     reference_points = np.array(chief.position)
-    normal = np.zeros((n_star, 3))
-    normal[:, 2] = 1.0
     on_detector = telescope.surfaces[-1].to_local(reference_points)
-    if focal_plane is None:
-        normal[:, :2] = -np.stack(telescope.surfaces[-1].shape.gradient(*on_detector[:, :2].T), axis=-1)
-    elif chief.ccd is not None:
+    slopes = np.stack(telescope.surfaces[-1].shape.gradient(*on_detector[:, :2].T), axis=-1)
+    if focal_plane is not None and chief.ccd is not None:
         place = focal_plane.camera.to_local(chief.ccd, on_detector[:, 0], on_detector[:, 1])
-        normal[:, :2] = -focal_plane.slopes_on(chief.ccd, *place)
+        slopes = slopes + focal_plane.slopes_on(chief.ccd, *place)
+    normal = np.column_stack([-slopes, np.ones(n_star)])
     rotation = telescope.surfaces[-1].matrix
     normal = normal @ rotation.T
 
