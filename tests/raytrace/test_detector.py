@@ -69,6 +69,18 @@ def test_heights_are_those_over_a_curved_detector():
     np.testing.assert_allclose(np.stack([photons.x, photons.y]), [x, y], atol=1e-12)
 
 
+def test_lost_rays_leave_the_others_on_the_mesh(lsst_r, focal_plane, bundles):
+    mesh, end = focal_plane.to_mesh(4), pachon.trace(lsst_r, bundles[0])
+    position, direction = end.position.copy(), end.direction.copy()
+    expected = pachon.raytrace.land_on_mesh(lsst_r.surfaces[-1], mesh, position, direction)
+    position[7], direction[[7, 11]] = np.nan, np.nan
+    landing = pachon.raytrace.land_on_mesh(lsst_r.surfaces[-1], mesh, position, direction)
+    lost = np.isin(np.arange(60), [7, 11])
+    assert (landing.facet[lost] == -1).all()
+    assert (expected.facet[~lost] >= 0).any()
+    np.testing.assert_array_equal(landing.position[~lost], expected.position[~lost])
+
+
 @pytest.mark.slow
 def test_mesh_agrees_to_the_facet_error(lsst_r, focal_plane, bundles):
     cells = 24
