@@ -259,6 +259,16 @@ def test_donuts_of_a_telescope_with_vanes():
     assert image.sum() == pytest.approx(rays.sum(), rel=2e-3)
 
 
+def test_rims_of_donuts_that_lose_a_third_of_their_light():
+    """Rays that the apertures of HSC stop land up to 50 mm away; rims are where rays pass."""
+    telescope, plane = defocused("hsc", 0.5e-3), ImagePlane(51, 15e-6, 5e-6)
+    field, at = np.radians([[0.0, 0.675]]), np.zeros((1, 2))
+    image = renderer_for(telescope, 770e-9, plane).render(field, at).image[0]
+    inputs = PsfInputs(telescope, np.array([770e-9]), plane, atmosphere=air(), threads=1)
+    rays = MeanRaysRenderer(inputs, 1 << 14).expose_without_refinement(Stars(field, at)).draw(None)[0]
+    np.testing.assert_allclose(rays, image, atol=0.02 * image.max())
+
+
 def test_dark_stars_and_points_asked_for(lsst_r):
     plate = Obstruction("lid", np.array([[[-9.0, -9.0, 9.0], [9.0, -9.0, 9.0], [0.0, 20.0, 9.0]]]))
     found = make_psfs(
