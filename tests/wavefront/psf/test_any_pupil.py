@@ -12,6 +12,7 @@ from pachon.models.aperture import Circle, Complement, Vane
 from pachon.models.obstruction import Obstruction
 from pachon.models.shapes.shape import Plane
 from pachon.models.surface import Interaction, Surface
+from pachon.raytrace.pack.surfaces import clear_annulus
 from pachon.wavefront.atmosphere.turbulence import diffraction_otf, structure_function
 from pachon.wavefront.psf.clear_pupil import lit_fractions
 from pachon.wavefront.psf.engine import PsfInputs, Stars
@@ -81,6 +82,12 @@ def tube(telescope):
     return replace(telescope, name="tube", surfaces=(ring, *telescope.surfaces))
 
 
+def discs_alone(telescope):
+    """A telescope without vanes, plates and other apertures that are no discs or rings."""
+    surfaces = [replace(s, aperture=None) if clear_annulus(s.aperture) is None else s for s in telescope.surfaces]
+    return replace(telescope, surfaces=tuple(surfaces), obstructions=())
+
+
 LSST, COARSE = ImagePlane(31, 10e-6, 4e-6), ImagePlane(37, 15e-6, 5e-6)
 
 
@@ -91,6 +98,7 @@ LSST, COARSE = ImagePlane(31, 10e-6, 4e-6), ImagePlane(37, 15e-6, 5e-6)
         pytest.param(lambda: defocused("hsc", 20e-6), (0.5, 0.5), COARSE, 770e-9, 0.0125, 1.0, marks=pytest.mark.slow),
         # Other wavelengths, where dark rays pass the lenses far outside of what is ground.
         (lambda: defocused("hsc", -10e-6), (-0.2, 0.69), COARSE, [700e-9, 820e-9], 0.0125, 1.0),
+        (lambda: discs_alone(pachon.load_telescope("hsc")), (0.1, 0.35), COARSE, 770e-9, 0.0125, 1.0),
         pytest.param(
             lambda: defocused("decam", 20e-6),
             (0.5, -0.7),
