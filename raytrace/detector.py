@@ -1,4 +1,4 @@
-"""Propagation of rays from the nominal focal surface to the CCD surfaces at their heights."""
+"""Propagation of rays from the nominal detector surface to the CCD surfaces at their heights over it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from ..core.threads import thread_count
 from ..models.camera.focal_plane import FocalPlane
+from ..models.shapes.shape import Plane, Shape
 from ..models.surface import Surface
 
 Triple = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -35,13 +36,13 @@ def land_on_ccds(
 ) -> Landing:
     """Propagate rays from the nominal detector surface to the CCD surfaces.
 
-    Heights are measured along the z axis of the detector's own frame, which is the telescope's +z unless the
-    detector was tilted; positions on the CCDs are that frame's x and y. ``position`` [m] and ``direction``, [n, 3], are
-    in the telescope frame; ``index`` is the refractive index before the detector.
+    Heights are those over the nominal surface, along the z axis of the detector's own frame, which is the telescope's
+    +z unless the detector was tilted; positions on the CCDs are that frame's x and y. ``position`` [m] and
+    ``direction``, [n, 3], are in the telescope frame; ``index`` is the refractive index before the detector.
     """
     (x, y, z), (u, v, w) = detector.to_local(position).T, detector.along(direction).T
     ccd = focal_plane.ccd_at(x, y)
-    t = _distance_to_ccd(focal_plane, ccd, (x, y, z), (u, v, w), STEPS)
+    t = _distance_to_ccd(detector.shape, focal_plane, ccd, (x, y, z), (u, v, w), STEPS)
     # A ray that crosses the edge on its last micrometres has left the CCD. (In a gap, index -1, t has no meaning.)
     on_ccd = (ccd >= 0) & (focal_plane.camera.depth(ccd, x + t * u, y + t * v) >= 0.0)
     ccd = np.where(on_ccd, ccd, -1).astype(np.int32)
@@ -50,7 +51,7 @@ def land_on_ccds(
 
 
 def land_bundle(
-    focal_plane: FocalPlane, position: Triple, direction: Triple, *, threads: int | None = None
+    detector: Surface, focal_plane: FocalPlane, position: Triple, direction: Triple, *, threads: int | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Propagate rays that land close to one another from the nominal surface to the CCD surfaces.
 
@@ -71,7 +72,7 @@ def land_bundle(
             )
             if ccd_index >= 0:
                 t[ray_indices] = _distance_to_ccd(
-                    focal_plane, np.array([ccd_index]), (px, py, pz), (u, v, w), BUNDLE_STEPS
+                    detector.shape, focal_plane, np.array([ccd_index]), (px, py, pz), (u, v, w), BUNDLE_STEPS
                 )
 
     starts = range(0, len(x), CHUNK)
@@ -86,18 +87,27 @@ def land_bundle(
 
 
 def _distance_to_ccd(
-    focal_plane: FocalPlane, ccd: np.ndarray, position: Triple, direction: Triple, steps: int
+    nominal: Shape, focal_plane: FocalPlane, ccd: np.ndarray, position: Triple, direction: Triple, steps: int
 ) -> np.ndarray:
-    """Return the distances to the surfaces of CCDs, one for each ray or one for all, in lengths of the direction."""
+    """Return the distances to the surfaces of CCDs, one for each ray or one for all, in lengths of the direction.
+
+    Heights of CCDs are those over a nominal shape.
+    """
     (x, y, z), (u, v, w) = position, direction
     frame, t = focal_plane.camera.frame(ccd), np.zeros(len(x))
     across_x, across_y = frame.along_ccd(u, v)
     for _ in range(steps):
         # The CCD stays that of the first intersection, so a ray near an edge cannot alternate between two CCDs.
-        dx, dy = frame.to_local(x + t * u, y + t * v)
+        px, py = x + t * u, y + t * v
+        dx, dy = frame.to_local(px, py)
         slope = focal_plane.surfaces.gradient(ccd, dx, dy)
         rate = w - slope[:, 0] * across_x - slope[:, 1] * across_y
-        t = t + (focal_plane.surfaces.height(ccd, dx, dy) - (z + t * w)) / rate
+        height = focal_plane.surfaces.height(ccd, dx, dy)
+        if not isinstance(nominal, Plane):
+            nominal_slope_x, nominal_slope_y = nominal.gradient(px, py)
+            rate = rate - nominal_slope_x * u - nominal_slope_y * v
+            height = height + nominal.sag(px, py)
+        t = t + (height - (z + t * w)) / rate
     return t
 
 

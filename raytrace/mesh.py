@@ -67,7 +67,8 @@ def land_on_mesh(
 
     facets = warp_mesh(mesh.vertices, mesh.faces)
     facet = wp.empty(len(p), dtype=wp.int32, device="cpu")
-    reach = float(2 * REACH / np.abs(d[:, 2]).min(initial=1.0))
+    # Rays that are lost have no direction.
+    reach = float(2 * REACH / np.nanmin(np.abs(d[:, 2]), initial=1.0))
     inputs = [facets.id, warp_array(start, wp.vec3), warp_array(d, wp.vec3), reach, facet]
     launch(first_facet, len(p), inputs, threads=threads)
 

@@ -95,7 +95,8 @@ def land_photons(
     x, y, z, u, v, w = from_packets(landing, n)
     lit = from_packets(statuses, n) == RayStatus.OK
     if focal_plane is not None:
-        x, y, on_ccd = land_bundle(focal_plane, (x, y, z), (u, v, w), threads=threads)
+        detector = telescope.surfaces[-1]
+        x, y, on_ccd = land_bundle(detector, focal_plane, (x, y, z), (u, v, w), threads=threads)
         lit &= on_ccd
     depth = np.abs(w)
     return LandedPhotons(x, y, u / depth, v / depth, lit)

@@ -122,9 +122,9 @@ def trace_pupils(
 
     Other arguments than the pupil points [n_pupil, 2] [m] and the vignetting factors of the stars [n_star, 5] are those
     of :meth:`pachon.Request.of`.
-    Each CCD is taken as its tangent plane at the reference point: over the blur of a star, some 50 um, a potato chip of
-    two cycles deviates from it by less than 0.2 nm. An aberration is added to the traced wavefront; reference points
-    and zero of the path stay those of the telescope without it.
+    Each CCD, or the nominal surface, is taken as its tangent plane at the reference point: over the blur of a star,
+    some 50 um, a potato chip of two cycles deviates from it by less than 0.2 nm. An aberration is added to the traced
+    wavefront; reference points and zero of the path stay those of the telescope without it.
 
     Raises
     ------
@@ -143,12 +143,12 @@ def trace_pupils(
 
     chief = reference_rays(request, request.middle, focal_plane)
     reference_points = np.array(chief.position)
-    normal = np.zeros((n_star, 3))
-    normal[:, 2] = 1.0
+    on_detector = telescope.surfaces[-1].to_local(reference_points)
+    slopes = np.stack(telescope.surfaces[-1].shape.gradient(*on_detector[:, :2].T), axis=-1)
     if focal_plane is not None and chief.ccd is not None:
-        on_detector = telescope.surfaces[-1].to_local(reference_points)
         place = focal_plane.camera.to_local(chief.ccd, on_detector[:, 0], on_detector[:, 1])
-        normal[:, :2] = -focal_plane.slopes_on(chief.ccd, *place)
+        slopes = slopes + focal_plane.slopes_on(chief.ccd, *place)
+    normal = np.column_stack([-slopes, np.ones(n_star)])
     rotation = telescope.surfaces[-1].matrix
     normal = normal @ rotation.T
 

@@ -86,7 +86,7 @@ def fft_psf(
     pixels : int
         Pixels on a side.
     n_pupil : int, optional
-        Lattice points across the pupil; by default at least 128, and enough for a period of the pattern of twice the
+        Lattice points across the pupil; by default at least 256, and enough for a period of the pattern of twice the
         side of the image.
     reference : {"centroid", "chief"}
         Middle of the images: the centroid of the rays, or the chief ray of the middle wavelength.

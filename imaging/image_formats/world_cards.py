@@ -15,7 +15,7 @@ from ...core.errors import ProductError, cut_short, shown
 #: Cards of world coordinates, of the image itself and not of alternatives to it.
 _CARDS = re.compile(
     r"(WCSAXES|CTYPE[12]|CUNIT[12]|CRVAL[12]|CRPIX[12]|CDELT[12]|CROTA[12]|CD[12]_[12]|PC[12]_[12]|PC00[12]00[12]"
-    r"|PV[12]_\d+|WAT[012]_\d+|(A|B|AP|BP)_(ORDER|DMAX|\d+_\d+)|RADE?[CS]YS|EQUINOX|LONPOLE|LATPOLE)"
+    r"|PV[12]_\d+|WAT[012]_\d+|(A|B|AP|BP)_(ORDER|DMAX|\d+_\d+)|RADEC?SYS|EQUINOX|EPOCH|LONPOLE|LATPOLE)"
 )
 #: Cards whose numbers must be finite.
 _NUMBERS = re.compile(r"(CRVAL|CRPIX|CDELT|CROTA|CD|PC|PV|A_|B_|AP_|BP_|EQUINOX|LONPOLE|LATPOLE)")
@@ -36,6 +36,8 @@ def world_cards(header: fits.Header, shape: tuple[int, int], path: Path) -> fits
     if not any(kind.startswith(("RA", "GLON", "ELON")) for kind in kinds):
         return None
     for card in header.cards:
+        if card.keyword == "EPOCH" and not _is_equinox(header, path):
+            continue
         if card.keyword and _CARDS.fullmatch(card.keyword) and card.keyword not in cards:
             cards[card.keyword] = _value(header, card.keyword, path)
     # wcslib takes the numbers of a projection as degrees where a header of an early IRAF has no unit.
@@ -67,6 +69,11 @@ def world_cards(header: fits.Header, shape: tuple[int, int], path: Path) -> fits
             key="CTYPE1",
         )
     return cards
+
+
+def _is_equinox(header: fits.Header, path: Path) -> bool:
+    """Return whether EPOCH is the equinox of the coordinates, as in headers before EQUINOX."""
+    return "EQUINOX" not in header and isinstance(_value(header, "EPOCH", path), (int, float))
 
 
 def _value(header: fits.Header, key: str, path: Path) -> object:

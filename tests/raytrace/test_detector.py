@@ -9,8 +9,11 @@ import pachon
 from pachon.core.errors import DomainError
 from pachon.models.camera.lsst import lsst_camera
 from pachon.models.media.medium import ConstantIndex
-from pachon.raytrace.rays import RayStatus
+from pachon.models.starting_designs.schmidt import schmidt
+from pachon.raytrace.photons import PhotonBeam, land_photons
+from pachon.raytrace.rays import RayStatus, field_direction
 from pachon.wavefront.chief_rays import fields_at
+from pachon.wavefront.pupil_optics import trace_pupils
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +47,38 @@ def test_rays_end_on_the_surface_and_on_their_own_line(lsst_r, focal_plane, bund
         assert np.abs(np.cross(step, flat.direction)).max() < 2e-15
         assert np.allclose(end.path_length - flat.path_length, np.einsum("ij,ij->i", step, flat.direction), atol=1e-14)
         assert np.array_equal(end.ccd, focal_plane.ccd_at(x, y))
+
+
+def test_heights_are_those_over_a_curved_detector():
+    """A Schmidt camera with a CCD that follows its focal surface, tilted and 30 um above it."""
+    telescope, grid = schmidt(0.5, 2.5), np.stack(np.meshgrid(*[np.linspace(-0.019, 0.019, 5)] * 2)).reshape(2, -1)
+    table = {"x": grid[0], "y": grid[1], "z": 3e-5 + 2e-4 * grid[0] - 1e-4 * grid[1]}
+    plane = pachon.FocalPlane.from_heights(table, "auxtel")
+    field, pupil = np.deg2rad((0.7, -0.5)), tuple(np.random.default_rng(1).uniform(-0.15, 0.15, (2, 40)))
+    end = pachon.trace(telescope, pachon.launch_rays(telescope, field, 590e-9, pupil), focal_plane=plane)
+    detector = telescope.surfaces[-1]
+    x, y, z = detector.to_local(end.position).T
+    assert np.abs(z - detector.shape.sag(x, y) - plane.height(x, y)).max() < 1e-14
+    optics = trace_pupils(telescope, [field], 590e-9, np.stack(pupil, axis=-1), focal_plane=plane)
+    offset = detector.to_local(end.position) - detector.to_local(optics.reference_points)
+    # The sphere departs from its tangent plane by 40 um squared over twice its radius.
+    np.testing.assert_allclose(optics.displacement[0, 0], offset[:, :2], atol=1e-9)
+    source = np.stack([-field_direction(*field), *np.zeros((2, 3))])
+    beam = PhotonBeam(tuple(np.zeros((2, 40))), source, pupil, np.full(40, 590e-9))
+    photons = land_photons(telescope, beam, focal_plane=plane)
+    np.testing.assert_allclose(np.stack([photons.x, photons.y]), [x, y], atol=1e-12)
+
+
+def test_lost_rays_leave_the_others_on_the_mesh(lsst_r, focal_plane, bundles):
+    mesh, end = focal_plane.to_mesh(4), pachon.trace(lsst_r, bundles[0])
+    position, direction = end.position.copy(), end.direction.copy()
+    expected = pachon.raytrace.land_on_mesh(lsst_r.surfaces[-1], mesh, position, direction)
+    position[7], direction[[7, 11]] = np.nan, np.nan
+    landing = pachon.raytrace.land_on_mesh(lsst_r.surfaces[-1], mesh, position, direction)
+    lost = np.isin(np.arange(60), [7, 11])
+    assert (landing.facet[lost] == -1).all()
+    assert (expected.facet[~lost] >= 0).any()
+    np.testing.assert_array_equal(landing.position[~lost], expected.position[~lost])
 
 
 @pytest.mark.slow

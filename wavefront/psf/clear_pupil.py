@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import warp as wp
@@ -15,7 +16,7 @@ from ...models.telescope import Telescope
 from ...raytrace.kernels.surface_table import STOPPED
 from ...raytrace.launch import launch_bundles
 from ...raytrace.pack.surfaces import clear_annulus, pack_surfaces
-from ...raytrace.rays import RayStatus
+from ...raytrace.rays import RayStatus, field_direction
 from ...raytrace.trace import trace, trace_packets
 from ..pupil_sampling import spiral_annulus
 from .clear_pupil_kernels import find_edges, square_distances
@@ -55,7 +56,8 @@ class SpokePupil:
 
         They stand on so many rings, by default as far apart as the spokes are.
         """
-        require_count(count, "n_pupil", 10)
+        if rings is None:
+            require_count(count, "n_pupil", 10)
         n_ring = rings or min(math.ceil(math.sqrt(count / _SPOKES_PER_RING)), MOST_RINGS)
         n_spoke = 4 * max(1, round(count / (4 * n_ring)))
         legendre = np.polynomial.legendre.Legendre.basis(n_ring - 1)
@@ -199,6 +201,21 @@ def _edge_radius(telescope: Telescope) -> np.ndarray:
     return np.linspace(telescope.pupil_obscuration * outer, outer, EDGE_RINGS)
 
 
+@lru_cache(maxsize=64)
 def has_only_annuli(telescope: Telescope) -> bool:
-    """Return whether all apertures are discs and rings, without obstructions."""
-    return not telescope.obstructions and all(clear_annulus(s.aperture) is not None for s in telescope.surfaces)
+    """Return whether all apertures are discs and rings about the light, without obstructions.
+
+    The chief ray on the axis passes within each disc, and within the hole of each ring.
+    """
+    rings = [clear_annulus(s.aperture) for s in telescope.surfaces]
+    if telescope.obstructions or any(ring is None for ring in rings):
+        return False
+    axis = field_direction(np.zeros(1), np.zeros(1))
+    chief = launch_bundles(telescope, axis, telescope.default_wavelength, np.zeros((1, 2)))
+    ends = trace(telescope, chief, "all", threads=1)
+    for surface, end, (x, y, inner, outer) in zip(telescope.surfaces, ends, filter(None, rings), strict=True):
+        place = surface.to_local(end.position)[0]
+        # A chief ray that misses a surface has no place there.
+        if np.hypot(place[0] - x, place[1] - y) > (inner or outer):
+            return False
+    return True

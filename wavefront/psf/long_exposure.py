@@ -49,7 +49,7 @@ from ..atmosphere.turbulence import coherence, structure_function
 from ..pupil_optics import PupilOptics
 from .clear_pupil import SpokePupil, clear_areas, clear_edges, has_only_annuli
 from .engine import ExposedStars, PsfEngine, PsfInputs, PsfRenderer, Stars, expose_by_kind, metric_of
-from .far_from_focus import bent_across_strips
+from .far_from_focus import bent_across_strips, stopped_rays_astray
 from .lattice_pupil import (
     LATTICE_POINTS,
     MOST_ACROSS,
@@ -269,7 +269,8 @@ class LongExposureRenderer(PsfRenderer):
         if self._options.n_pupil is None:
             rays, air = self._ray_counts(optics), self._atmosphere
             bent = air is not None and bent_across_strips(optics, self.focal_length, self._diameter, air.r0)
-            kinds = np.where(bent, -1 - len(self.dense), np.where(rays > 0, rays, kinds))
+            astray = stopped_rays_astray(optics, self._pupil.radius, self.focal_length)
+            kinds = np.where(bent | (astray & (rays == 0)), -1 - len(self.dense), np.where(rays > 0, rays, kinds))
         if (kinds == _NEAR).all():
             return self._expose_spokes(optics, edges, stars, self._pupil)
         near = np.flatnonzero(kinds == _NEAR)

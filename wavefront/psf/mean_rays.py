@@ -101,14 +101,16 @@ class MeanRaysRenderer(FastRenderer):
         landing = channels.displacement(optics)
         kx, ky = np.meshgrid(self._kx, self._ky)
         thinned = slice(None, None, max(1, len(self._points) // _SMOOTH_POINTS))
-        smooth = PupilPolynomials(self._points[thinned], np.zeros(2), 0.0)
 
         def diffract(star: int) -> None:
             for channel, wave in enumerate(channels.wave):
                 wavelength = float(self._wavelengths[wave])
-                bare = landing[star, channel, thinned].astype(np.float64)
-                if not (np.isfinite(bare).all() and light[star, wave].any()):
+                # Dark rays may pass a lens far outside of what is ground.
+                lit = optics.lit[star, wave, thinned]
+                if not (lit.any() and light[star, wave].any()):
                     continue
+                bare = landing[star, channel, thinned][lit].astype(np.float64)
+                smooth = PupilPolynomials(self._points[thinned][lit], np.zeros(2), 0.0)
                 # Baseline over wavelength: J^T k / 2 pi.
                 jacobian = optics.jacobian[star] * wavelength / (2.0 * np.pi)
                 x, y = (jacobian[0, i] * kx + jacobian[1, i] * ky for i in (0, 1))

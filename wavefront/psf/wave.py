@@ -38,6 +38,7 @@ import warp as wp
 
 from ...core.arguments import check_arguments
 from ...core.launch import launch
+from ...core.memory import require_bytes
 from ...core.threads import thread_count
 from ...core.units import require_positive
 from ...core.warp_arrays import warp_array
@@ -62,6 +63,8 @@ FEWEST_ACROSS = 96
 _NEGLIGIBLE = 1e-4
 # Longest baselines of a grid that are tried.
 _TRIED = 64
+# Most pairs of a pixel and a baseline at a time [64 MB an array of complex numbers]; stamps of 64 pixels have fewer.
+_PAIRS = 2**22
 
 
 @check_arguments
@@ -121,9 +124,13 @@ class WaveRenderer(PsfRenderer):
             longest = LONGEST_BASELINE
         elif padding is None and self._atmosphere is not None:
             longest = self._longest_baseline()
+        # One star's fields, their squares, the intensity and its transform.
+        across, n_channel = math.ceil((diameter + longest) / spacing), len(self._channels.wave)
+        needed = across**2 * (8 * len(self._wavelengths) + 16 * n_channel + 24)
+        require_bytes(needed, f"{across} points across the wave engine's grid, {spacing:.2g} m apart")
         self._lattice = PupilLattice.fill(diameter, traced_obscuration(self._obscuration), spacing)
         self._packets = -(-self._lattice.size // LANES)
-        across = max(math.ceil((diameter + longest) / spacing), self._packets * LANES)
+        across = max(across, self._packets * LANES)
         # Multiples of 4 fill whole packets.
         self._size = 4 * scipy.fft.next_fast_len(-(-across // 4))
         self._reach = min(math.floor(longest / spacing), (self._size - 1) // 2)
@@ -298,10 +305,15 @@ class WaveRenderer(PsfRenderer):
         pixels = np.stack([x, y], axis=-1).reshape(-1, 2) - offset * self._plane.pixel_size
         angles = np.linalg.solve(jacobian, pixels.T)
         image = np.zeros(side * side)
+        at_a_time = max(1, _PAIRS // len(step))
         for wave, wavelength in enumerate(self._wavelengths):
             k_step = 2.0 * math.pi * self._lattice.spacing / wavelength
-            turn = -1j * k_step * (angles - self._dispersion[wave][:, None])
-            rows = np.exp(turn[1][:, None] * step) @ spectra[wave]
-            total = np.einsum("px,px->p", rows, np.exp(turn[0][:, None] * step)).real
-            image += (self._plane.pixel_size * k_step / (2.0 * math.pi)) ** 2 / abs(np.linalg.det(jacobian)) * total
+            per_pair = (self._plane.pixel_size * k_step / (2.0 * math.pi)) ** 2 / abs(np.linalg.det(jacobian))
+            turns = -1j * k_step * (angles - self._dispersion[wave][:, None])
+            for first in range(0, side * side, at_a_time):
+                some = slice(first, first + at_a_time)
+                turn = turns[:, some]
+                rows = np.exp(turn[1][:, None] * step) @ spectra[wave]
+                total = np.einsum("px,px->p", rows, np.exp(turn[0][:, None] * step)).real
+                image[some] += per_pair * total
         return image.reshape(side, side)

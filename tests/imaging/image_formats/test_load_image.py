@@ -4,6 +4,7 @@ import gzip
 
 import numpy as np
 import pytest
+from astropy.coordinates import FK4, FK5, ICRS, SkyCoord
 from astropy.io import fits
 from astropy.wcs import WCS
 from drawn_fields import GAIN, SIDE, header_of, world
@@ -290,10 +291,26 @@ def test_galactic_coordinates_and_swapped_axes(field, tmp_path, axes):
     header = header_of()
     (header["CTYPE1"], header["CRVAL1"]), (header["CTYPE2"], header["CRVAL2"]) = axes.items()
     image = pachon.load_image(plain(tmp_path / "a.fits", field, header))
-    from astropy.coordinates import SkyCoord
-
     at = np.array([[0.5 * SIDE - 1.0] * 2])
     expected = SkyCoord(l=120.0, b=-20.0, unit="deg", frame="galactic").icrs
+    np.testing.assert_allclose(image.celestial(at)[0], [expected.ra.deg, expected.dec.deg], atol=1e-9)
+    np.testing.assert_allclose(image.pixels_at(image.celestial(at)), at, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("cards", "frame"),
+    [
+        ({"EPOCH": 1950.0}, FK4(equinox="B1950")),
+        ({"RADECSYS": "FK4"}, FK4(equinox="B1950")),
+        ({"RADECSYS": "FK5", "EQUINOX": 1975.0}, FK5(equinox="J1975")),
+        ({"RADECSYS": "ICRS", "EQUINOX": 2000.0, "EPOCH": 1950.0}, ICRS()),
+        ({"EPOCH": "survey"}, ICRS()),
+    ],
+)
+def test_equinox_and_system_by_their_old_names(field, tmp_path, cards, frame):
+    image = pachon.load_image(plain(tmp_path / "a.fits", field, header_of(**cards)))
+    at = np.array([[0.5 * SIDE - 1.0] * 2])
+    expected = SkyCoord(150.0, 2.0, unit="deg", frame=frame).icrs
     np.testing.assert_allclose(image.celestial(at)[0], [expected.ra.deg, expected.dec.deg], atol=1e-9)
     np.testing.assert_allclose(image.pixels_at(image.celestial(at)), at, atol=1e-6)
 

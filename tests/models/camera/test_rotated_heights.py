@@ -124,7 +124,7 @@ def test_rays_land_on_rotated_ccds(angles):
     # Newton's third step leaves less than rounding.
     assert np.abs(z - plane.height(x, y)).max() < 1e-19
     start = tuple(np.column_stack([xy, np.zeros(len(xy))])[on].T)
-    x, y, lit = land_bundle(plane, start, tuple(direction[on].T))
+    x, y, lit = land_bundle(detector, plane, start, tuple(direction[on].T))
     assert lit.all()
     assert np.allclose(np.stack([x, y], -1), landed.position[on][:, :2], rtol=0, atol=1e-15)
 

@@ -12,7 +12,9 @@ from pachon.models.aperture import Circle, Complement, Vane
 from pachon.models.obstruction import Obstruction
 from pachon.models.shapes.shape import Plane
 from pachon.models.surface import Interaction, Surface
+from pachon.raytrace.pack.surfaces import clear_annulus
 from pachon.wavefront.atmosphere.turbulence import diffraction_otf, structure_function
+from pachon.wavefront.psf.clear_pupil import lit_fractions
 from pachon.wavefront.psf.engine import PsfInputs, Stars
 from pachon.wavefront.psf.image_plane import ImagePlane
 from pachon.wavefront.psf.lattice_pupil import FEWEST_POINTS, LatticeTransfer
@@ -80,6 +82,12 @@ def tube(telescope):
     return replace(telescope, name="tube", surfaces=(ring, *telescope.surfaces))
 
 
+def discs_alone(telescope):
+    """A telescope without vanes, plates and other apertures that are no discs or rings."""
+    surfaces = [replace(s, aperture=None) if clear_annulus(s.aperture) is None else s for s in telescope.surfaces]
+    return replace(telescope, surfaces=tuple(surfaces), obstructions=())
+
+
 LSST, COARSE = ImagePlane(31, 10e-6, 4e-6), ImagePlane(37, 15e-6, 5e-6)
 
 
@@ -90,6 +98,7 @@ LSST, COARSE = ImagePlane(31, 10e-6, 4e-6), ImagePlane(37, 15e-6, 5e-6)
         pytest.param(lambda: defocused("hsc", 20e-6), (0.5, 0.5), COARSE, 770e-9, 0.0125, 1.0, marks=pytest.mark.slow),
         # Other wavelengths, where dark rays pass the lenses far outside of what is ground.
         (lambda: defocused("hsc", -10e-6), (-0.2, 0.69), COARSE, [700e-9, 820e-9], 0.0125, 1.0),
+        (lambda: discs_alone(pachon.load_telescope("hsc")), (0.1, 0.35), COARSE, 770e-9, 0.0125, 1.0),
         pytest.param(
             lambda: defocused("decam", 20e-6),
             (0.5, -0.7),
@@ -225,6 +234,23 @@ def test_vanes_and_solids_are_served(lsst_r):
         assert found.inside == pytest.approx(plain.inside, abs=5e-4)
 
 
+@pytest.mark.parametrize(
+    ("aperture", "lit"),
+    [
+        (Complement(Circle(0.5, x=3.4)), 1.0 - 0.5**2 / (4.18**2 - 2.558**2)),
+        (Circle(0.6, x=-2.0, y=2.6), 0.6**2 / (4.18**2 - 2.558**2)),
+    ],
+)
+def test_discs_beside_the_axis(lsst_r, aperture, lit):
+    """No spoke of a few tens is one clear piece there, or meets them."""
+    plane = Surface("mask", Interaction.PASS, Plane(), (0.0, 0.0, 9.0), lsst_r.medium_before, aperture)
+    telescope = replace(lsst_r, surfaces=(plane, *lsst_r.surfaces))
+    found = make_psfs(telescope, np.zeros((1, 2)), 620e-9, atmosphere=air(), engine="long_exposure")
+    assert found.lit_fraction == pytest.approx(lit, abs=1e-3)
+    # Of a thousand rays.
+    assert lit_fractions(telescope, np.array([[0.0, 0.0, -1.0]]), 620e-9) == pytest.approx(lit, abs=3e-3)
+
+
 def test_donuts_of_a_telescope_with_vanes():
     """Out of focus the points are as close as the donut needs, and its image is that of brute force."""
     telescope, plane = defocused("hsc", 0.5e-3), ImagePlane(51, 15e-6, 5e-6)
@@ -239,6 +265,16 @@ def test_donuts_of_a_telescope_with_vanes():
     rays = MeanRaysRenderer(inputs, 1 << 14).expose_without_refinement(Stars(field, np.zeros((1, 2)))).draw(None)[0]
     np.testing.assert_allclose(image, rays, atol=0.05 * rays.max())
     assert image.sum() == pytest.approx(rays.sum(), rel=2e-3)
+
+
+def test_rims_of_donuts_that_lose_a_third_of_their_light():
+    """Rays that the apertures of HSC stop land up to 50 mm away; rims are where rays pass."""
+    telescope, plane = defocused("hsc", 0.5e-3), ImagePlane(51, 15e-6, 5e-6)
+    field, at = np.radians([[0.0, 0.675]]), np.zeros((1, 2))
+    image = renderer_for(telescope, 770e-9, plane).render(field, at).image[0]
+    inputs = PsfInputs(telescope, np.array([770e-9]), plane, atmosphere=air(), threads=1)
+    rays = MeanRaysRenderer(inputs, 1 << 14).expose_without_refinement(Stars(field, at)).draw(None)[0]
+    np.testing.assert_allclose(rays, image, atol=0.02 * image.max())
 
 
 def test_dark_stars_and_points_asked_for(lsst_r):

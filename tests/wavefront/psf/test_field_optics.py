@@ -53,6 +53,13 @@ def test_optics_are_those_of_rays(lsst, plane, rotator_deg):
         assert (interpolated.lit == traced.lit)[np.broadcast_to(beside, traced.lit.shape)].all()
 
 
+def test_the_fewest_points_that_engines_take(lsst):
+    """Ten points make two rings of four."""
+    pupil = SpokePupil.fill(lsst.pupil_diameter, lsst.pupil_obscuration, 10)
+    optics = field_optics(lsst, WAVES, pupil)
+    np.testing.assert_array_equal(optics.pupil, pupil.points)
+
+
 def test_any_angle_of_the_rotator_has_the_same_polynomials(lsst):
     tilted = lsst.perturbed(lsst.surfaces[-1].name, tilt=(1e-5, 2e-5, 0.0))
     field_optics_module._field_optics.cache_clear()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import pachon
+from pachon.core import memory
 from pachon.core.errors import DomainError
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.screen_sampling import ScreenSampling
@@ -264,3 +265,19 @@ def test_heights_of_the_ccds_defocus_the_image(lsst_r):
 def test_refuses_bad_spacing(spacing):
     with pytest.raises(DomainError, match="pupil_spacing"):
         WaveEngine(pupil_spacing=spacing)
+
+
+def test_large_stamps_in_parts(polynomial_pupil, monkeypatch):
+    """Pixels take turns, so that stamps of hundreds of pixels do not take tens of gigabytes for themselves."""
+    inputs = polynomial_pupil(diameter=2.0, coma=0.5e-6).inputs(ONE_WAVE, PLANE)
+    whole = WaveEngine().renderer(inputs).render(*STAR).image
+    monkeypatch.setattr("pachon.wavefront.psf.wave._PAIRS", 2**10)
+    np.testing.assert_allclose(WaveEngine().renderer(inputs).render(*STAR).image, whole, rtol=0, atol=1e-12)
+
+
+def test_a_grid_larger_than_memory(polynomial_pupil, monkeypatch):
+    inputs = polynomial_pupil(diameter=2.0).inputs(ONE_WAVE, PLANE)
+    monkeypatch.setattr(memory, "available_bytes", lambda: 10**9)
+    WaveEngine().renderer(inputs)
+    with pytest.raises(DomainError, match=r"points across the wave engine.s grid, 0.0001 m apart: needs about .* GB"):
+        WaveEngine(pupil_spacing=1e-4).renderer(inputs)
