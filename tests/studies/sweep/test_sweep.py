@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -224,6 +225,26 @@ def test_every_metric_gives_finite_figures(folder):
         "throughput_min",
         "Z4_nm",
     } <= names
+
+
+def test_bins_of_the_correlation_have_one_name_in_all_replicas():
+    """Stars of another seed have other mean separations: replicas would never meet in one column."""
+    base = {"ccds": ["R22_S11"], "psf": {"engine": "long_exposure"}, "stars": {"truth": 15}}
+    sweep = read_sweep(
+        {"base": base, "parameters": {"M2.dz_um": {"nominal": 0, "values": [0]}}, "metrics": ["xi_bins"]}, "test"
+    )
+    found = []
+    for seed in (1, 2):
+        experiment = point_experiment(sweep, SweepPoint(0, {"M2.dz_um": 0}, seed), Path())
+        scene = Scene(experiment.telescope, experiment, threads=1)
+        found.append(STARS["xi_bins"].compute(scene))
+        assert list(found[-1].values())[: scene.bins.n_bins] == pytest.approx(scene.correlation.xi_plus, nan_ok=True)
+    # Stars that reach farther have a bin more.
+    few, many = sorted(found, key=len)
+    assert set(few) <= set(many)
+    # Eight bins from 10 arcmin to 3 degrees, and as wide ones below.
+    middles = [float(name.split("_")[2]) for name in many if name.startswith("xi_plus")]
+    assert middles == pytest.approx(10.0 * 18.0 ** ((np.arange(len(middles)) - 7.5) / 8.0), rel=3e-3)
 
 
 def test_more_points_than_there_is_room_for_are_refused_before_starting(folder):
