@@ -53,6 +53,24 @@ def test_effects_budget_and_allowances_are_those_of_a_sum_of_squares(tmp_path):
     assert page.index(sentence) < page.index("<img") < page.index("<table")
 
 
+@pytest.mark.usefixtures("empty_pictures")
+@pytest.mark.parametrize(
+    ("excess", "words"), [(0.3, "they do not simply add"), (0.0, "they add, as far as this tells")]
+)
+def test_effects_that_do_not_add_in_any_replica_do_not_add(tmp_path, excess, words):
+    """All at once make three tenths more in each of four replicas, whose effects differ by far more than that."""
+    sweep = SWEEP.model_copy(update={"design": SWEEP.design.model_copy(update={"replicas": 4})})
+    points = numbered_points(sweep, Path())
+    create_store(tmp_path / "s.sweep", sweep, points, {})
+    seeds = sorted({p.seed for p in points})
+    with SweepStore(tmp_path / "s.sweep") as store:
+        for p in points:
+            a, b = (p.parameters[name] ** 2 for name in "ab")
+            xi = 1e-6 * (1 + seeds.index(p.seed)) * (a + 3.0 * b) * (1.0 + excess * (a > 0.0 and b > 0.0))
+            store.write(PointResult(p.number, {"xi_raw_short": xi}, None, 0.1, "here"))
+        assert words in write_report(store, tmp_path / "report").read_text()
+
+
 @pytest.mark.long
 def test_metrics_of_a_store_write_no_picture_outside_the_folder(tmp_path):
     points = numbered_points(SWEEP, Path())
