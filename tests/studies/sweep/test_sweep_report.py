@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from pachon.core.page import with_digits
+from pachon.models.parameters.changes import ANGLES, LENGTHS
 from pachon.studies.metrics.stars import STARS
 from pachon.studies.metrics.telescope import TELESCOPE_METRICS
 from pachon.studies.sweep.analysis import allowances, curves
@@ -151,6 +152,9 @@ def test_every_metric_and_parameter_is_defined_in_the_report(tmp_path):
     assert described_parameter("focal_plane.raft_um") == ("um", "rafts, peak to valley, not the budget's [um]")
     assert described_parameter("R22_S11.rx_urad") == ("urad", "change of R22_S11: tilt about x")
     assert described_parameter("M1.Z5_nm") == ("nm", "change of Z5 of M1")
+    for unit in (*LENGTHS, *ANGLES):
+        assert described_parameter(f"L1.rx_{unit}") == (unit, "change of L1: tilt about x")
+        assert described_metric(f"solved L1.rx_{unit}").unit == unit
     content = {"parameters": {"M2.dz_um": {"nominal": 0, "range": [0, 4]}}, "design": {"points": 3}}
     sweep = read_sweep(content, "test")
     create_store(tmp_path / "s.sweep", sweep, points := numbered_points(sweep, Path()), {})
