@@ -30,7 +30,7 @@ def has_no_camera(sweep: SweepFile, parameters: Point, folder: Path) -> bool:
     """Return whether the telescope of a point has no camera."""
     base = sweep.base if isinstance(sweep.base, dict) else {}
     name = parameters.get("telescope", base.get("telescope"))
-    return isinstance(name, str) and _without_camera(_path(name, folder))
+    return isinstance(name, str) and _without_camera(telescope_path(name, folder))
 
 
 def point_metrics(sweep: SweepFile, parameters: Point, folder: Path, threads: int) -> dict[str, float]:
@@ -60,7 +60,7 @@ def point_telescope(sweep: SweepFile, parameters: Point, folder: Path) -> tuple[
         if key not in KEYS:
             raise ConfigError(f"base.{key}: expected {', '.join(KEYS)} alone, for a telescope without a camera")
     config = configuration_of(content, f"sweep {sweep.name}")
-    telescope = load_telescope(_path(config.telescope or "", folder))
+    telescope = load_telescope(telescope_path(config.telescope or "", folder))
     return apply_changes(telescope, config.changes), config
 
 
@@ -76,7 +76,8 @@ def check_telescope_sweep(sweep: SweepFile, parameters: Point, folder: Path) -> 
         telescope.check_field(*np.deg2rad(sweep.fields_deg).T)
 
 
-def _path(name: str, folder: Path) -> str:
+def telescope_path(name: str, folder: Path) -> str:
+    """Return a bundled name as it is, and the path of a file from a folder."""
     return name if name in BUNDLED or not (folder / name).is_file() else str(folder / name)
 
 
