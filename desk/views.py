@@ -252,7 +252,7 @@ def images_view(scene: Scene) -> ImagesView:
     reach = 1.2 * max(float(np.quantile(away, 0.99)), airy)
     image, _, _ = np.histogram2d(landing[:, 1], landing[:, 0], bins=_PIXELS, range=[[-reach, reach]] * 2, weights=light)
     seen = seen_curve = None
-    pixel = 0.0
+    pixel, inside = 0.0, 1.0
     largest = reach
     if scene.atmosphere is not None:
         stamp = make_psfs(
@@ -264,14 +264,14 @@ def images_view(scene: Scene) -> ImagesView:
             stamps=stamps_of(scene),
             engine="long_exposure",
         )
-        seen, pixel = stamp.image[0], stamp.pixel_scale / ARCSEC
+        seen, pixel, inside = stamp.image[0], stamp.pixel_scale / ARCSEC, float(stamp.inside[0])
         largest = max(reach, 3.0 * scene.state.seeing_arcsec)
     radius = np.linspace(0.0, largest, _RADII)
     order = np.argsort(away)
     held = np.interp(radius, away[order], np.cumsum(light[order]) - 0.5 * light[order], left=0.0, right=1.0)
     if seen is not None:
         at, within = energy_curve(seen)
-        seen_curve = np.interp(radius, at * pixel, within)
+        seen_curve = inside * np.interp(radius, at * pixel, within)
     return ImagesView(image, 2.0 * reach / _PIXELS, seen, pixel, radius, held, seen_curve)
 
 

@@ -14,7 +14,17 @@ from pachon.core.errors import ConfigError, DomainError, PachonError, UnknownNam
 from pachon.desk.bench import Bench
 from pachon.desk.python_text import python_text
 from pachon.desk.state import DeskState, History, is_state_file
-from pachon.desk.views import Scene, WhiskersView, layout_of, numbers, opd_view, section_view, spots_view, whiskers_view
+from pachon.desk.views import (
+    Scene,
+    WhiskersView,
+    images_view,
+    layout_of,
+    numbers,
+    opd_view,
+    section_view,
+    spots_view,
+    whiskers_view,
+)
 from pachon.models import OpticsState
 from pachon.wavefront.psf.stamps import Stamps
 
@@ -136,6 +146,22 @@ def test_whiskers_are_the_moments_of_the_stars_on_their_ccds():
     # Moments of the rays and of a Gaussian seeing: the same pattern, but for weights.
     far = replace(BENCH.start, optics={"M2_dz": 400.0})
     assert "rays" in whiskers_view(Scene.of(BENCH, far)).method
+
+
+def test_encircled_energy_is_of_all_light_not_of_that_on_the_stamp():
+    scene = Scene.of(BENCH, replace(BENCH.start, seeing_arcsec=2.0))
+    stamps = Stamps.of_camera("lsst", size=101)
+    wide = pachon.make_psfs(
+        scene.telescope, scene.field[None], scene.wavelength,
+        atmosphere=scene.atmosphere, engine="long_exposure", stamps=stamps,
+    )  # fmt: skip
+    y, x = np.mgrid[-50:51, -50:51]
+    order = np.argsort(np.hypot(x, y), axis=None)
+    within = wide.inside[0] * np.cumsum(wide.image[0].ravel()[order])
+    radius = np.hypot(x, y).ravel()[order][np.searchsorted(within, 0.8)] * np.rad2deg(wide.pixel_scale) * 3600
+    found, _ = numbers(None, None, None, images_view(scene))["80 % of the light at the star within"]
+    # Rings of pixels are a tenth of an arcsecond wide.
+    assert found == pytest.approx(radius, abs=0.05)
 
 
 def test_whiskers_have_the_angle_and_length_of_the_ellipticity():
