@@ -199,6 +199,15 @@ def test_the_python_program_prints_the_numbers_of_the_desk(state, capsys, tmp_pa
     assert "rms radius of the spot [um]" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("kind", ["gregorian", "ritchey-chretien"])
+def test_whiskers_without_a_camera_stand_where_their_stars_land(kind):
+    """A Gregorian turns the sky by half a circle against a Cassegrain."""
+    telescope = pachon.new_telescope(kind)
+    places, fields = Bench(telescope).stars()
+    assert pachon.fields_at(telescope, places) == pytest.approx(fields, abs=1e-9)
+    assert np.sign(places[-1, 1]) == (-1.0 if kind == "gregorian" else 1.0) * np.sign(fields[-1, 1])
+
+
 @pytest.mark.long
 def test_a_lens_without_a_camera_has_radii_and_thicknesses(tmp_path):
     pachon.save_telescope(pachon.new_telescope("triplet"), tmp_path / "triplet.yaml")
