@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import ConfigError, unknown_name
+from ...core.units import angular
 from ...models.io.bundled import BUNDLED
 from ...models.io.prescription import load_telescope
 from ...models.parameters.changes import apply_changes, parse_change
@@ -45,6 +46,8 @@ def point_metrics(sweep: SweepFile, parameters: Point, folder: Path, threads: in
     metrics: dict[str, float] = {}
     for name in dict.fromkeys(sweep.metrics):
         metrics |= TELESCOPE_METRICS[name].compute(scene)
+    if telescope.design_data.afocal:
+        metrics = {angular(name): value for name, value in metrics.items()}
     return metrics | {f"solved {name}": value for name, value in solved.items()}
 
 
