@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 from .aperture import Annulus
+from .design_data import DesignData
 from .shapes.shape import Conic, Plane
 from .surface import Interaction, Surface
 from .telescope import VACUUM, Telescope
 
 
 def ideal_telescope(telescope: Telescope, focal_ratio: float = 1000.0) -> Telescope:
-    """Return a telescope with the same pupil and negligible aberrations: one slow paraboloid.
+    """Return a telescope with a pupil of the same size and negligible aberrations: one slow paraboloid in vacuum.
 
     At f/N (`focal_ratio`) its coma, 3 theta / (16 N^2), and its astigmatism, theta^2 / (2 N), blur a star at an angle
     theta from the axis: at f/1000 by 1e-4 and 9e-4 arcsec 10 arcmin from it, at f/100 000 by 1e-7 and 1e-3 arcsec at
@@ -32,7 +33,11 @@ def ideal_telescope(telescope: Telescope, focal_ratio: float = 1000.0) -> Telesc
         stop_z=0.0,
         launch_distance=1.5 * length,
         reference_sphere_radius=length,
+        medium_before=VACUUM,
         groups={},
         group_frames={},
         camera=None,
+        # Its stop is none of these surfaces.
+        design_data=DesignData(),
+        pupil_center=(0.0, 0.0),
     )
