@@ -112,7 +112,8 @@ def diagnose_command(
     if as_json:
         print_json(result.as_dict())
         return
-    rows.show()
+    if not quiet:
+        rows.show()
     if result.missing:
         reason = next(iter(result.missing.values()))
         wide_console().print(
