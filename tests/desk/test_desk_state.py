@@ -148,6 +148,18 @@ def test_whiskers_are_the_moments_of_the_stars_on_their_ccds():
     assert "rays" in whiskers_view(Scene.of(BENCH, far)).method
 
 
+def test_a_star_whose_annulus_misses_the_detector_has_zernikes_of_its_lit_part():
+    """At the rim of the field of HSC the wavefront of the star before stayed in the picture."""
+    bench = Bench("hsc")
+    x, y = np.rad2deg(bench.spot_fields[0])
+    scene = Scene.of(bench, replace(bench.start, field_deg=(x, y)))
+    request = pachon.Request.of(bench.nominal, scene.field[None], scene.wavelength)
+    with pytest.raises(DomainError, match="rays of the annulus miss the detector"):
+        pachon.wavefront_zernikes(request, jmax=22)
+    lit = pachon.wavefront_zernikes(request, jmax=22, pupil="lit").coefficients[0, 3:]
+    np.testing.assert_allclose(opd_view(scene).zernikes_nm, 1e9 * lit, rtol=1e-9)
+
+
 def test_encircled_energy_is_of_all_light_not_of_that_on_the_stamp():
     scene = Scene.of(BENCH, replace(BENCH.start, seeing_arcsec=2.0))
     stamps = Stamps.of_camera("lsst", size=101)
