@@ -19,6 +19,7 @@ from pachon.core.errors import ConfigError, PachonError
 from pachon.core.units import ARCSEC
 from pachon.models.io.bundled import DATA
 from pachon.models.io.prescription import load_telescope
+from pachon.pipeline.config import with_run
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.focal_plane_stage import apply_focal_plane_model
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
@@ -298,6 +299,23 @@ def test_sweep_files_may_name_the_file_of_their_configuration(folder):
     (folder / "base.yaml").write_text("seed: 5\nccds: [R22_S11]\n")
     (folder / "two.yaml").write_text("base: base.yaml\nparameters: {band: {nominal: r, values: [r, i]}}\n")
     assert load_sweep(folder / "two.yaml").base == {"seed": 5, "ccds": ["R22_S11"]}
+
+
+def test_files_of_a_configuration_in_another_folder_lie_beside_it(folder):
+    """As for the run alone; a file of the same name beside the sweep is another one."""
+    runs = folder / "runs"
+    runs.mkdir()
+    for place in (runs / "mine.yaml", runs / "site.yaml", folder / "mine.yaml"):
+        place.write_text("content: of no matter here\n")
+    (runs / "run.yaml").write_text("telescope: mine.yaml\natmosphere: {site: site.yaml}\nccds: [R22_S11]\n")
+    (folder / "two.yaml").write_text("base: runs/run.yaml\nparameters: {band: {nominal: r, values: [r, i]}}\n")
+    base = load_sweep(folder / "two.yaml").base
+    assert (base["telescope"], base["atmosphere"]["site"]) == (str(runs / "mine.yaml"), str(runs / "site.yaml"))
+    # Of nights, visits and images too.
+    run = with_run({"run": "runs/run.yaml"}, folder / "night.yaml")["run"]
+    assert run == {**base, "ccds": ["R22_S11"]}
+    beside = with_run({"run": "run.yaml"}, runs / "night.yaml")["run"]
+    assert beside["telescope"] == "mine.yaml"
 
 
 @pytest.mark.slow
