@@ -57,7 +57,8 @@ class FocalBench:
         #: Shapes at the places, and their standard deviations.
         self.predicted: tuple[PsfShapes, PsfShapes] = model.predict(names, *self.places.T)
         #: FWHM of round Gaussians of the same weighted sizes, and their standard deviations [arcsec].
-        self.fwhm, self.fwhm_error = _gaussian_fwhm(*(shapes.size for shapes in self.predicted), model.weight_fwhm)
+        shapes, sigma = self.predicted
+        self.fwhm, self.fwhm_error = _gaussian_fwhm(shapes.size, sigma.size, model.weight_fwhm)
 
     @classmethod
     def read(cls, path: Path) -> FocalBench:
