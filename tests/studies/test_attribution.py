@@ -207,6 +207,12 @@ def test_a_lifted_ground_layer_is_the_same_air(tiny):
     assert lifted.atmosphere.screens("slopes") is full.atmosphere.screens("slopes")
 
 
+def test_the_command_names_every_cause(capsys):
+    assert main(["attribute", "--help"]) == 0
+    words = set(capsys.readouterr().out.replace(",", " ").replace(";", " ").split())
+    assert words > set(CAUSES)
+
+
 def test_without_heights_or_active_optics_nothing_is_moved(tiny):
     """Shims are motions of rafts: without the heights that they make up for, they would be heights themselves."""
     for options in ({}, {"focal_plane__budget": "flat"}, {"focal_plane__heights": "lsstcam"}):
