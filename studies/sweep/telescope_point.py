@@ -15,7 +15,7 @@ import numpy as np
 from ...core.errors import ConfigError, unknown_name
 from ...core.units import angular
 from ...models.io.bundled import BUNDLED
-from ...models.io.prescription import load_telescope
+from ...models.io.prescription import load_telescope, prescription_digest
 from ...models.parameters.changes import apply_changes, parse_change
 from ...models.telescope import Telescope
 from ...pipeline.config import Configuration, configuration_of
@@ -31,7 +31,10 @@ def has_no_camera(sweep: SweepFile, parameters: Point, folder: Path) -> bool:
     """Return whether the telescope of a point has no camera."""
     base = sweep.base if isinstance(sweep.base, dict) else {}
     name = parameters.get("telescope", base.get("telescope"))
-    return isinstance(name, str) and _without_camera(telescope_path(name, folder))
+    if not isinstance(name, str):
+        return False
+    path = telescope_path(name, folder)
+    return _without_camera(path, prescription_digest(path) if Path(path).is_file() else "")
 
 
 def point_metrics(sweep: SweepFile, parameters: Point, folder: Path, threads: int) -> dict[str, float]:
@@ -85,5 +88,7 @@ def telescope_path(name: str, folder: Path) -> str:
 
 
 @lru_cache(maxsize=64)
-def _without_camera(path: str) -> bool:
+def _without_camera(path: str, digest: str) -> bool:
+    """Return whether the telescope in a file of that digest has no camera: points of a sweep share the answer."""
+    del digest  # part of the key
     return load_telescope(path).camera is None

@@ -17,6 +17,7 @@ from pachon.studies.sweep.file import read_sweep
 from pachon.studies.sweep.store import SweepStore
 from pachon.studies.sweep.sweep import run_sweep
 from pachon.studies.sweep.table import described_metric
+from pachon.studies.sweep.telescope_point import has_no_camera
 
 LENS = "tests/data/zmx/lens1.zmx"
 FIELDS = [[0.0, 0.0], [0.0, 8.0]]
@@ -60,6 +61,16 @@ def test_points_against_telescopes_made_by_hand(tmp_path):
         assert wavefront == pytest.approx(1e9 * np.sqrt(np.mean(squares)), rel=0.03)
     assert len(table) == 2
     assert table.metrics["spot_rms_um"][1] > 1.1 * table.metrics["spot_rms_um"][0]
+
+
+def test_a_file_that_gets_a_camera_has_one(tmp_path):
+    """Within one process, as of a notebook."""
+    path = tmp_path / "mine.yaml"
+    sweep = read_sweep({**CONTENT, "base": {"telescope": str(path)}}, "test")
+    pachon.save_telescope(pachon.load_telescope(LENS), path)
+    assert has_no_camera(sweep, {}, tmp_path)
+    pachon.save_telescope(pachon.load_telescope("lsst_v3.3_r"), path)
+    assert not has_no_camera(sweep, {}, tmp_path)
 
 
 def test_compensators(tmp_path):
