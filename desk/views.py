@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,6 +36,8 @@ JMAX = 22
 _HEIGHTS = 100
 #: Pixels along a side of PSFs; radii of encircled energy.
 _PIXELS = 41
+#: Least fraction of the stars whose moments under a weight exist for whiskers of these.
+_MEASURED = 0.9
 #: Pixels along a side of stamps of the camera.
 _STAMP = 27
 _RADII = 61
@@ -161,16 +163,26 @@ class WhiskersView:
 def whiskers_view(scene: Scene, per_ccd: int = 1) -> WhiskersView:
     """Return the shapes of stars by their moments, without images: adaptive ones with an atmosphere.
 
-    Second moments of rays, with a Gaussian of the seeing, stand in for them far from focus, and for telescopes other
-    than the LSST, whose vignetted pupils take seconds.
+    Second moments of rays, with a Gaussian of the seeing, stand in for them far from focus, where the others of many
+    stars do not exist, and for telescopes other than the LSST, whose vignetted pupils take seconds.
     """
     places, star_fields = scene.bench.stars(per_ccd)
+    rays = _ray_whiskers(scene, places, star_fields)
     if not scene.bench.is_lsst:
-        return _ray_whiskers(scene, places, star_fields)
+        return rays
     try:
-        return _weighted_whiskers(scene, places, star_fields)
+        view = _weighted_whiskers(scene, places, star_fields)
     except DomainError:
-        return _ray_whiskers(scene, places, star_fields)
+        return rays
+    if np.isfinite(view.e1).mean() < _MEASURED:
+        return rays
+    if scene.atmosphere is not None:
+        return view
+    # Within its weight no star is wider than that: its width is that of rays, pixels and diffusion.
+    stamps = stamps_of(scene)
+    blur = FWHM_PER_RMS * math.hypot(stamps.pixel_size / math.sqrt(12.0), stamps.diffusion)
+    fwhm = np.hypot(rays.fwhm_arcsec, blur * scene.bench.plate_scale / ARCSEC)
+    return replace(view, fwhm_arcsec=fwhm)
 
 
 def _ray_whiskers(scene: Scene, places: np.ndarray, star_fields: np.ndarray) -> WhiskersView:

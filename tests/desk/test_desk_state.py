@@ -176,6 +176,16 @@ def test_encircled_energy_is_of_all_light_not_of_that_on_the_stamp():
     assert found == pytest.approx(radius, abs=0.05)
 
 
+def test_widths_of_stars_are_not_those_of_a_weight():
+    # The 0.3 arcsec weight of stars without air is the width of none that is larger; and many have no moments under it.
+    states = [replace(BENCH.start, seeing_arcsec=0.0, optics={"M2_dz": dz}) for dz in (0.0, 40.0, 80.0, 120.0)]
+    widths = [np.median(whiskers_view(Scene.of(BENCH, state)).fwhm_arcsec) for state in states]
+    assert 0.2 < widths[0] < 0.3
+    assert widths[1:] == sorted(widths[1:])
+    # Widths of a star out of focus grow with the distance from it.
+    assert widths[3] / widths[2] == pytest.approx(120.0 / 80.0, rel=0.02)
+
+
 def test_whiskers_have_the_angle_and_length_of_the_ellipticity():
     e, angle = 0.1, np.deg2rad(30.0)
     components = (e * np.cos(2.0 * angle), e * np.sin(2.0 * angle))
