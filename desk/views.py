@@ -90,6 +90,7 @@ class SpotsView:
     rms_um: np.ndarray  #: rms radius [um], [n]; NaN where no light arrives
     rms_arcsec: np.ndarray
     lit: np.ndarray  #: lit fraction of the pupil, [n]
+    unit: str = "um"  #: urad instead of um where the image is at infinity
 
 
 def spots_view(scene: Scene) -> SpotsView:
@@ -104,7 +105,8 @@ def spots_view(scene: Scene) -> SpotsView:
     x, y = 1e6 * (diagram.displacement[:, 0] - diagram.centroid[:, None])[lit].T
     rms = diagram.rms_radius
     arcsec = rms * diagram.plate_scale / ARCSEC
-    return SpotsView(np.rad2deg(diagram.fields), x, y, index, rms * 1e6, arcsec, diagram.lit_fraction)
+    unit = diagram.image_unit("um")
+    return SpotsView(np.rad2deg(diagram.fields), x, y, index, rms * 1e6, arcsec, diagram.lit_fraction, unit)
 
 
 @dataclass(frozen=True)
@@ -352,9 +354,9 @@ def numbers(
     """Return the numbers that stand beside the pictures, with their units; those of missing views are left out."""
     table: dict[str, tuple[float, str]] = {}
     if spots_now is not None:
-        table["spot rms radius, median"] = (finite_median(spots_now.rms_um), "um")
+        table["spot rms radius, median"] = (finite_median(spots_now.rms_um), spots_now.unit)
         table["spot rms radius, median on the sky"] = (finite_median(spots_now.rms_arcsec), "arcsec")
-        table["spot rms radius, largest"] = (float(np.nanmax(spots_now.rms_um, initial=0.0)), "um")
+        table["spot rms radius, largest"] = (float(np.nanmax(spots_now.rms_um, initial=0.0)), spots_now.unit)
     if opd is not None:
         table["wavefront rms at the star"] = (opd.rms_nm, "nm")
     if whiskers is not None:

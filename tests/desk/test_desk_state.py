@@ -12,6 +12,7 @@ import pachon
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, PachonError, UnknownNameError
 from pachon.desk.bench import Bench
+from pachon.desk.design_views import SPOTS, sensitivity_view
 from pachon.desk.python_text import python_text
 from pachon.desk.state import DeskState, History, is_state_file
 from pachon.desk.views import (
@@ -26,6 +27,7 @@ from pachon.desk.views import (
     whiskers_view,
 )
 from pachon.models import OpticsState
+from pachon.models.design_data import DesignData
 from pachon.wavefront.psf.stamps import Stamps
 
 BENCH = Bench("lsst_v3.3_r")
@@ -201,6 +203,16 @@ def test_the_section_names_every_surface_with_its_radius():
     assert set(BENCH.nominal.surface_names) <= set(pieces)
     assert pieces["M1"].text == f"radius {BENCH.nominal.surface('M1').shape.parameters['radius']:.6g} m, mirror"
     assert pieces["L1"].glass
+
+
+def test_spots_at_infinity_are_in_angles():
+    bench = Bench(replace(pachon.load_telescope("lsst_v3.3_r"), camera=None, design_data=DesignData(afocal=True)))
+    scene = Scene.of(bench, bench.start)
+    view = spots_view(scene)
+    assert sensitivity_view(scene, SPOTS).unit == "urad"
+    table = numbers(view, None, None, None)
+    assert [table[f"spot rms radius, {name}"][1] for name in ("median", "largest")] == ["urad", "urad"]
+    assert "[urad]" in python_text(bench, bench.start)
 
 
 def test_light_that_does_not_arrive_is_one_line():
