@@ -112,7 +112,8 @@ def diagnose_command(
     if as_json:
         print_json(result.as_dict())
         return
-    rows.show()
+    if not quiet:
+        rows.show()
     if result.missing:
         reason = next(iter(result.missing.values()))
         wide_console().print(
@@ -156,7 +157,8 @@ def attribute_command(
             listed=True,
             metavar="CAUSE,...",
             help="Causes to switch off, separated by commas, of global, raft, ccd, tilt, potato_chip, heights, "
-            "active_optics, optics, atmosphere, ground_layer, diffusion, noise; all that are on by default.",
+            "active_optics, optics, atmosphere, ground_layer, diffusion, absorption_depth, brighter_fatter, "
+            "tree_rings, edge_rolloff, noise; all that are on by default.",
         ),
     ] = None,
     average: Annotated[bool, Option("--average", help="Average over all turbulence; quick.")] = False,

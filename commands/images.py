@@ -111,7 +111,7 @@ def images_command(
         require_list(("--visit", visit), ("--where", where), ("--band", band), ("--night", night))
     else:
         images_config = images_config.of_visit(
-            listed_visit(images_config.run, visit_list, visit, where, band, night), folder
+            listed_visit(images_config.run, visit_list, visit, where, band, night, folder), folder
         )
     experiment = images_config.experiment(folder)
     if quick and images_config.image.side is None:

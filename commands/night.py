@@ -81,13 +81,23 @@ def night_settings(config: Path | None, set_texts: Sequence[str] | None, **optio
 
 
 def listed_visit(
-    config: Configuration, path: Path, number: int | None, where: str | None, band: str | None, night: int | None
+    config: Configuration,
+    path: Path,
+    number: int | None,
+    where: str | None,
+    band: str | None,
+    night: int | None,
+    folder: Path | None = None,
 ) -> ListedVisit:
-    """Return the visit of a number of a list, or the only one of a selection."""
+    """Return the visit of a number of a list, or the only one of a selection.
+
+    Relative paths in the configuration start from the folder, that of the list from the current one.
+    """
     from ..core.errors import DomainError
     from ..studies.night.config import ListSection, read_section
 
-    visits = read_section(ListSection(list=str(path), where=where, band=band, night=night), config)
+    section = ListSection(list=str(path.absolute()), where=where, band=band, night=night)
+    visits = read_section(section, config, folder)
     for remark in visits.remarks:
         print_line(f"pachon: {path.name}: {remark}", error=True)
     if number is not None:

@@ -109,8 +109,9 @@ def run_command(
         experiment = configured_experiment(config, settings, **options)
     else:
         base = configuration(config, settings, **options)
-        listed = listed_visit(base, visit_list, visit, where, band, night)
-        experiment = listed_experiment(base, listed, None if config is None else config.parent)
+        folder = None if config is None else config.parent
+        listed = listed_visit(base, visit_list, visit, where, band, night, folder)
+        experiment = listed_experiment(base, listed, folder)
     hint = f"finished CCDs are in {out}, and --resume goes on from there"
     with long_work(
         quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers

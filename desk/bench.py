@@ -21,7 +21,8 @@ from ..models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
 from ..models.parameters.parameters import usual_parameters
 from ..models.surface import Interaction
 from ..models.telescope import Telescope
-from ..wavefront.chief_rays import fields_at
+from ..wavefront.chief_rays import fields_at, reference_rays
+from ..wavefront.request import Request
 from .state import DeskState
 
 #: Blur that a control makes at the ends of its slider, about [arcsec].
@@ -229,7 +230,7 @@ class Bench:
             axis = np.linspace(-1.0, 1.0, 9 if per_ccd == 1 else 15)
             grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
             fields = self.nominal.field_radius * grid[np.hypot(*grid.T) <= 1.0]
-            return fields / self.plate_scale, fields
+            return self._landing(fields), fields
         count = len(self.camera)
         columns = math.ceil(math.sqrt(_STARS / count))
         rows = columns * (5 if per_ccd > 1 else 1)
@@ -240,6 +241,15 @@ class Bench:
         local = np.tile(dx, count) * half[:, 0], np.tile(dy, count) * half[:, 1]
         fields, places = self._seen(np.stack(self.camera.from_local(index, *local), axis=-1))
         return places, fields
+
+    def _landing(self, fields: np.ndarray) -> np.ndarray:
+        """Return where the chief rays of fields [rad] land on the detector [m]; in scale where one does not."""
+        wavelength = self.nominal.default_wavelength
+        try:
+            chief = reference_rays(Request.of(self.nominal, fields, wavelength), wavelength)
+        except DomainError:
+            return fields / self.plate_scale
+        return self.nominal.surfaces[-1].to_local(chief.position)[:, :2]
 
     def _seen(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return field angles [rad] and places [m] of those places that the telescope covers."""

@@ -110,7 +110,8 @@ def sensitivity_view(scene: Scene, metric: str) -> SensitivityView:
     if metric == SPOTS:
         residuals, slopes = _Spots(scene, bench.freedoms).derivatives()
         radius = float(np.linalg.norm(residuals))
-        unit, value, derivative = "um", 1e6 * radius, 1e6 * (residuals @ slopes) / radius
+        unit = "urad" if bench.nominal.design_data.afocal else "um"
+        value, derivative = 1e6 * radius, 1e6 * (residuals @ slopes) / radius
     else:
         detector = scene.telescope.surfaces[-1]
         # A star sees of its CCD the height alone.

@@ -56,6 +56,9 @@ class FocalBench:
         names = [mosaic.names[i] for i in self.ccd]
         #: Shapes at the places, and their standard deviations.
         self.predicted: tuple[PsfShapes, PsfShapes] = model.predict(names, *self.places.T)
+        #: FWHM of round Gaussians of the same weighted sizes, and their standard deviations [arcsec].
+        shapes, sigma = self.predicted
+        self.fwhm, self.fwhm_error = _gaussian_fwhm(shapes.size, sigma.size, model.weight_fwhm)
 
     @classmethod
     def read(cls, path: Path) -> FocalBench:
@@ -73,9 +76,8 @@ class FocalBench:
         """Return the predicted shapes, weighted moments, at all places."""
         shapes, _ = self.predicted
         x_mm, y_mm = 1e3 * self.places.T
-        fwhm = FWHM_PER_RMS * shapes.size / ARCSEC
         title = f"Predicted shapes at {counted(len(self), 'place')}"
-        return WhiskersView(x_mm, y_mm, shapes.e1, shapes.e2, fwhm, title)
+        return WhiskersView(x_mm, y_mm, shapes.e1, shapes.e2, self.fwhm, title)
 
     def heights(self) -> HeightsView | None:
         """Return the fitted heights of the CCDs; None without a telescope."""
@@ -86,9 +88,9 @@ class FocalBench:
         shapes, sigma = self.predicted
         values, unit = {
             "e": (100.0 * np.hypot(shapes.e1, shapes.e2), "%"),
-            "FWHM": (FWHM_PER_RMS * shapes.size / ARCSEC, "arcsec"),
+            "FWHM": (self.fwhm, "arcsec"),
             "uncertainty of e": (100.0 * np.sqrt(0.5 * (sigma.e1**2 + sigma.e2**2)), "%"),
-            "uncertainty of FWHM": (FWHM_PER_RMS * sigma.size / ARCSEC, "arcsec"),
+            "uncertainty of FWHM": (self.fwhm_error, "arcsec"),
         }[name]
         x_mm, y_mm = 1e3 * self.places.T
         return PlacesView(x_mm, y_mm, values, f"{name} [{unit}]", f"{name[0].upper()}{name[1:]} of the prediction")
@@ -124,14 +126,21 @@ class FocalBench:
     def numbers(self, place: int) -> dict[str, tuple[float, str]]:
         """Return the numbers of the model and of a place, with their units."""
         shapes, sigma = self.predicted
-        size = FWHM_PER_RMS / ARCSEC
         e = 100.0 * np.hypot(shapes.e1, shapes.e2)
         return {
             "stars of the fit": (float(self.model.used.sum()), ""),
             "e, median": (finite_median(e), "%"),
-            "FWHM, median": (finite_median(size * shapes.size), "arcsec"),
+            "FWHM, median": (finite_median(self.fwhm), "arcsec"),
             **{f"chi-square of {name}": (value, "") for name, value in self.model.chi2.items()},
             "e1 at the place": (100.0 * float(shapes.e1[place]), f"± {100.0 * sigma.e1[place]:.2g} %"),
             "e2 at the place": (100.0 * float(shapes.e2[place]), f"± {100.0 * sigma.e2[place]:.2g} %"),
-            "FWHM at the place": (size * float(shapes.size[place]), f"± {size * sigma.size[place]:.2g} arcsec"),
+            "FWHM at the place": (float(self.fwhm[place]), f"± {self.fwhm_error[place]:.2g} arcsec"),
         }
+
+
+def _gaussian_fwhm(size: np.ndarray, sigma: np.ndarray, weight_fwhm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return FWHM [arcsec] and standard deviations of round Gaussians of rms sizes [rad] under a weight of a FWHM."""
+    ratio = FWHM_PER_RMS * size / weight_fwhm
+    # The product of image and weight is a Gaussian whose inverse variance is the sum of theirs.
+    factor = np.where(ratio < 1.0, 1.0 - ratio**2, np.nan)
+    return FWHM_PER_RMS * size / np.sqrt(factor) / ARCSEC, FWHM_PER_RMS * sigma * factor**-1.5 / ARCSEC

@@ -171,7 +171,7 @@ class SpotsPicture(Picture):
         self.figure.scatter("x", "y", source=self._star, marker="square", **star)
         self.figure.line("x", "y", source=self._bar_line, line_width=3, color=ORANGE)
         self._label = self.figure.text("x", "y", "text", source=self._bar, text_font_size="11px", y_offset=-4)
-        tips = [("field [deg]", "@x{0.000}, @y{0.000}"), ("rms radius", "@rms{0.00} um, @arcsec{0.000} arcsec")]
+        tips = [("field [deg]", "@x{0.000}, @y{0.000}"), ("rms radius", "@rms{0.00} @unit, @arcsec{0.000} arcsec")]
         self.figure.add_tools(HoverTool(renderers=[marks], tooltips=tips), TapTool(renderers=[marks]))
 
         def chosen(attribute: str, old: list[int], new: list[int]) -> None:
@@ -194,11 +194,11 @@ class SpotsPicture(Picture):
             "y": np.float32(field[near, 1] + scale * view.y[near]),
         }
         marks = {"x": view.field_deg[:, 0], "y": view.field_deg[:, 1], "rms": view.rms_um, "arcsec": view.rms_arcsec}
-        self._marks.data = marks
+        self._marks.data = {**marks, "unit": [view.unit] * len(view.rms_um)}
         self._star.data = {"x": [star_deg[0]], "y": [star_deg[1]]}
         x0, y0 = self._fields[:, 0].min() - 0.3 * self._spacing, self._fields[:, 1].min() - 0.75 * self._spacing
         self._bar_line.data = {"x": [x0, x0 + scale * bar], "y": [y0, y0]}
-        self._bar.data = {"x": [x0], "y": [y0], "text": [f"{bar:.4g} um"]}
+        self._bar.data = {"x": [x0], "y": [y0], "text": [f"{bar:.4g} {view.unit}"]}
 
     def paint(self, theme: str) -> None:
         """Colour all but the spots by a theme."""

@@ -32,11 +32,12 @@ def python_text(bench: Bench, state: DeskState) -> str:
     if state.seeing_arcsec > 0:
         r0 = f"{KOLMOGOROV_WIDTH} * {WAVELENGTH} / np.deg2rad({state.seeing_arcsec!r} / 3600)"
         lines.append(f"atmosphere = pachon.Atmosphere.from_site({SITE!r}, 1, r0={r0})")
+    unit = "urad" if bench.nominal.design_data.afocal else "um"
     rings = f"n_pupil={RINGS}, focal_plane=focal_plane"
     lines += [
         "",
         f"spots = pachon.spots(telescope, star, wavelength, {rings})",
-        "print('rms radius of the spot [um]:', spots.rms_radius * 1e6)",
+        f"print('rms radius of the spot [{unit}]:', spots.rms_radius * 1e6)",
         "request = pachon.Request.of(telescope, star, wavelength).on(focal_plane)",
         "zernikes = pachon.wavefront_zernikes(request, jmax=22)",
         "print('Zernikes from Z4 [nm]:', zernikes.coefficients[0, 3:] * 1e9)",

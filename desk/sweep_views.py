@@ -18,7 +18,7 @@ from ..studies.sweep.analysis import curves, rank_correlations
 from ..studies.sweep.point import point_configuration
 from ..studies.sweep.store import SweepPoint, SweepStore
 from ..studies.sweep.table import described_metric, described_parameter, read_table
-from ..studies.sweep.telescope_point import has_no_camera, point_telescope
+from ..studies.sweep.telescope_point import has_no_camera, point_telescope, telescope_path
 from .bench import Bench
 from .state import DeskState
 
@@ -111,6 +111,8 @@ class SweepBench(PointsBench):
                 # Studies of tolerances keep theirs in the same place.
                 raise ProductError("expected the store of a sweep, such as pachon sweep makes", file=path) from None
             self.table = read_table(store)
+            # From which relative paths of telescopes start.
+            self._folder = Path(store.about.get("folder", ""))
             self._points = {point.number: point for point in store.points()}
         if not len(self.table):
             raise ProductError("no point has been computed yet", file=path)
@@ -170,21 +172,21 @@ class SweepBench(PointsBench):
         point = self._points[number]
         with error_context(subject=f"point {number}"):
             config = self._configuration(point)
-            bench = Bench(config.telescope or f"lsst_v3.3_{config.band or 'r'}")
-            for name in point.parameters:
-                if name not in _OF_THE_MODEL and name not in config.changes:
-                    raise DomainError(f"{name}: expected parameters of the telescope alone")
-            optics = dict(_control(bench, name, float(value)) for name, value in config.changes.items())
+            name = config.telescope or f"lsst_v3.3_{config.band or 'r'}"
+            bench = Bench(telescope_path(name, self._folder))
+            for parameter in point.parameters:
+                if parameter not in _OF_THE_MODEL and parameter not in config.changes:
+                    raise DomainError(f"{parameter}: expected parameters of the telescope alone")
+            optics = dict(_control(bench, change, float(value)) for change, value in config.changes.items())
             state = replace(bench.start, optics=optics)
             if config.wavelengths_nm:
                 state = replace(state, wavelength_nm=float(np.median(config.wavelengths_nm)))
             return bench, bench.check(state)
 
     def _configuration(self, point: SweepPoint) -> Configuration:
-        folder = Path()
-        if has_no_camera(self.sweep, point.parameters, folder):
-            return point_telescope(self.sweep, point.parameters, folder)[1]
-        return point_configuration(self.sweep, point.parameters, point.seed, folder)
+        if has_no_camera(self.sweep, point.parameters, self._folder):
+            return point_telescope(self.sweep, point.parameters, self._folder)[1]
+        return point_configuration(self.sweep, point.parameters, point.seed, self._folder)
 
 
 def is_store(path: Path) -> bool:

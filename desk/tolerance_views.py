@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,8 +37,8 @@ class ToleranceBench(PointsBench):
     units : dict of str to str
         Their units.
     ends : dict of str to (float, float)
-        Changes of the merit by each tolerance alone at minus and plus its size; without a sensitivity study, NaN and
-        the rms contribution.
+        Changes of the merit by each tolerance alone at minus and plus its size, the costliest first; without a
+        sensitivity study, NaN and the rms contribution.
     folder : Path, optional
         Folder of the study, whose draws open as telescopes; a result alone holds no telescope.
     """
@@ -58,11 +57,10 @@ class ToleranceBench(PointsBench):
         folder: Path | None = None,
     ) -> None:
         compensators = [key for key in columns if key.endswith(_COMPENSATOR)]
-        costliest = sorted(ends, key=lambda key: -_size(ends[key]))
         super().__init__(
             name,
             np.arange(len(columns[merit])),
-            {key: columns[key] for key in (*costliest, *compensators)},
+            {key: columns[key] for key in (*ends, *compensators)},
             {key: columns[key] for key in (merit, *compensators)},
         )
         self._units, self._ends, self._sizes, self._axis = units, ends, sizes, axis
@@ -84,10 +82,12 @@ class ToleranceBench(PointsBench):
         if isinstance(drawn, ToleranceStudy):
             pairs = scale * (np.stack([drawn.lower, drawn.upper], axis=-1) - drawn.nominal)
             axis = f"change of {merit}, the tolerance alone"
+            order = drawn.offenders
         else:
             pairs = scale * np.stack([np.full(len(names), np.nan), drawn.contribution], axis=-1)
             axis = f"rms contribution to {merit}"
-        ends = {key: (float(low), float(high)) for key, (low, high) in zip(names, pairs, strict=True)}
+            order = np.argsort(-drawn.contribution, kind="stable")
+        ends = {names[i]: (float(pairs[i, 0]), float(pairs[i, 1])) for i in order}
         sizes = {t.name: _text(t.size, unit) for t, unit in zip(drawn.tolerances, drawn.units, strict=True)}
         return cls(drawn.telescope, merit, columns, units, ends, sizes, _with_unit(axis, criterion.unit))
 
@@ -106,7 +106,8 @@ class ToleranceBench(PointsBench):
             names["merit"] = merit
             columns = {names[key]: np.asarray(values, dtype=float) for key, values in draws.items()}
             units = {names[key]: str(getattr(values, "unit", None) or "") for key, values in draws.items()}
-            rows = [sensitivity[key] for key in ("name", "lower_end", "upper_end", "size", "unit")]
+            order = np.argsort(-np.asarray(sensitivity["cost"], dtype=float), kind="stable")
+            rows = [np.asarray(sensitivity[key])[order] for key in ("name", "lower_end", "upper_end", "size", "unit")]
             ends, sizes = {}, {}
             for key, low, high, size, size_unit in zip(*rows, strict=True):
                 ends[str(key)] = (float(low) - nominal, float(high) - nominal)
@@ -139,7 +140,7 @@ class ToleranceBench(PointsBench):
 
     def tornado(self, metric: str) -> TornadoView:
         """Return what each tolerance alone does to the merit, the costliest last; the same for all numbers."""
-        names = sorted(self._ends, key=lambda key: _size(self._ends[key]))
+        names = [*reversed(self._ends)]
         low, high = np.array([self._ends[key] for key in names]).reshape(-1, 2).T
         return TornadoView(tuple(names), low, high, tuple(self._sizes[key] for key in names), self._axis)
 
@@ -147,12 +148,6 @@ class ToleranceBench(PointsBench):
 def is_tolerance_folder(folder: Path) -> bool:
     """Return whether a folder has the tables of ``pachon tolerance``."""
     return all((folder / name).is_file() for name in (_DRAWS, _SENSITIVITY))
-
-
-def _size(ends: Sequence[float]) -> float:
-    """Return the larger change; one that loses the light has none."""
-    finite = [abs(end) for end in ends if np.isfinite(end)]
-    return max(finite, default=0.0)
 
 
 def _with_unit(name: str, unit: str) -> str:

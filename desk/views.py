@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,6 +36,8 @@ JMAX = 22
 _HEIGHTS = 100
 #: Pixels along a side of PSFs; radii of encircled energy.
 _PIXELS = 41
+#: Least fraction of the stars whose moments under a weight exist for whiskers of these.
+_MEASURED = 0.9
 #: Pixels along a side of stamps of the camera.
 _STAMP = 27
 _RADII = 61
@@ -88,6 +90,7 @@ class SpotsView:
     rms_um: np.ndarray  #: rms radius [um], [n]; NaN where no light arrives
     rms_arcsec: np.ndarray
     lit: np.ndarray  #: lit fraction of the pupil, [n]
+    unit: str = "um"  #: urad instead of um where the image is at infinity
 
 
 def spots_view(scene: Scene) -> SpotsView:
@@ -102,7 +105,8 @@ def spots_view(scene: Scene) -> SpotsView:
     x, y = 1e6 * (diagram.displacement[:, 0] - diagram.centroid[:, None])[lit].T
     rms = diagram.rms_radius
     arcsec = rms * diagram.plate_scale / ARCSEC
-    return SpotsView(np.rad2deg(diagram.fields), x, y, index, rms * 1e6, arcsec, diagram.lit_fraction)
+    unit = diagram.image_unit("um")
+    return SpotsView(np.rad2deg(diagram.fields), x, y, index, rms * 1e6, arcsec, diagram.lit_fraction, unit)
 
 
 @dataclass(frozen=True)
@@ -122,7 +126,12 @@ def opd_view(scene: Scene) -> OpdView:
     opd = wavefront_opd(scene.telescope, scene.field, scene.wavelength, grid=_GRID, focal_plane=plane)
     flat = opd.without_tilt * 1e9
     request = Request.of(scene.telescope, scene.field[None], scene.wavelength).on(plane)
-    zernikes = wavefront_zernikes(request, jmax=JMAX).coefficients[0] * 1e9
+    try:
+        fit = wavefront_zernikes(request, jmax=JMAX)
+    except DomainError:
+        # Rays beyond the clear apertures may miss the detector.
+        fit = wavefront_zernikes(request, jmax=JMAX, pupil="lit")
+    zernikes = fit.coefficients[0] * 1e9
     lit = np.isfinite(flat)
     rms = float(np.sqrt(np.mean(flat[lit] ** 2))) if lit.any() else math.nan
     step = float(opd.x[0, 1] - opd.x[0, 0]) if opd.x.shape[1] > 1 else 0.0
@@ -156,16 +165,26 @@ class WhiskersView:
 def whiskers_view(scene: Scene, per_ccd: int = 1) -> WhiskersView:
     """Return the shapes of stars by their moments, without images: adaptive ones with an atmosphere.
 
-    Second moments of rays, with a Gaussian of the seeing, stand in for them far from focus, and for telescopes other
-    than the LSST, whose vignetted pupils take seconds.
+    Second moments of rays, with a Gaussian of the seeing, stand in for them far from focus, where the others of many
+    stars do not exist, and for telescopes other than the LSST, whose vignetted pupils take seconds.
     """
     places, star_fields = scene.bench.stars(per_ccd)
+    rays = _ray_whiskers(scene, places, star_fields)
     if not scene.bench.is_lsst:
-        return _ray_whiskers(scene, places, star_fields)
+        return rays
     try:
-        return _weighted_whiskers(scene, places, star_fields)
+        view = _weighted_whiskers(scene, places, star_fields)
     except DomainError:
-        return _ray_whiskers(scene, places, star_fields)
+        return rays
+    if np.isfinite(view.e1).mean() < _MEASURED:
+        return rays
+    if scene.atmosphere is not None:
+        return view
+    # Within its weight no star is wider than that: its width is that of rays, pixels and diffusion.
+    stamps = stamps_of(scene)
+    blur = FWHM_PER_RMS * math.hypot(stamps.pixel_size / math.sqrt(12.0), stamps.diffusion)
+    fwhm = np.hypot(rays.fwhm_arcsec, blur * scene.bench.plate_scale / ARCSEC)
+    return replace(view, fwhm_arcsec=fwhm)
 
 
 def _ray_whiskers(scene: Scene, places: np.ndarray, star_fields: np.ndarray) -> WhiskersView:
@@ -252,7 +271,7 @@ def images_view(scene: Scene) -> ImagesView:
     reach = 1.2 * max(float(np.quantile(away, 0.99)), airy)
     image, _, _ = np.histogram2d(landing[:, 1], landing[:, 0], bins=_PIXELS, range=[[-reach, reach]] * 2, weights=light)
     seen = seen_curve = None
-    pixel = 0.0
+    pixel, inside = 0.0, 1.0
     largest = reach
     if scene.atmosphere is not None:
         stamp = make_psfs(
@@ -264,14 +283,14 @@ def images_view(scene: Scene) -> ImagesView:
             stamps=stamps_of(scene),
             engine="long_exposure",
         )
-        seen, pixel = stamp.image[0], stamp.pixel_scale / ARCSEC
+        seen, pixel, inside = stamp.image[0], stamp.pixel_scale / ARCSEC, float(stamp.inside[0])
         largest = max(reach, 3.0 * scene.state.seeing_arcsec)
     radius = np.linspace(0.0, largest, _RADII)
     order = np.argsort(away)
     held = np.interp(radius, away[order], np.cumsum(light[order]) - 0.5 * light[order], left=0.0, right=1.0)
     if seen is not None:
         at, within = energy_curve(seen)
-        seen_curve = np.interp(radius, at * pixel, within)
+        seen_curve = inside * np.interp(radius, at * pixel, within)
     return ImagesView(image, 2.0 * reach / _PIXELS, seen, pixel, radius, held, seen_curve)
 
 
@@ -335,9 +354,9 @@ def numbers(
     """Return the numbers that stand beside the pictures, with their units; those of missing views are left out."""
     table: dict[str, tuple[float, str]] = {}
     if spots_now is not None:
-        table["spot rms radius, median"] = (finite_median(spots_now.rms_um), "um")
+        table["spot rms radius, median"] = (finite_median(spots_now.rms_um), spots_now.unit)
         table["spot rms radius, median on the sky"] = (finite_median(spots_now.rms_arcsec), "arcsec")
-        table["spot rms radius, largest"] = (float(np.nanmax(spots_now.rms_um, initial=0.0)), "um")
+        table["spot rms radius, largest"] = (float(np.nanmax(spots_now.rms_um, initial=0.0)), spots_now.unit)
     if opd is not None:
         table["wavefront rms at the star"] = (opd.rms_nm, "nm")
     if whiskers is not None:

@@ -103,7 +103,11 @@ class StackSession(PageSession):
         figure = self.whiskers.figure
         figure.xaxis.axis_label, figure.yaxis.axis_label = "x of the stack [arcmin]", "y of the stack [arcmin]"
         [hover] = figure.select({"type": HoverTool})
-        hover.tooltips = [("x, y [arcmin]", "@x{0.00}, @y{0.00}"), ("g", "@e{0.00} %"), ("FWHM", "@fwhm{0.000} arcsec")]
+        hover.tooltips = [
+            ("x, y [arcmin]", "@x{0.00}, @y{0.00}"),
+            ("g", "@e{0.00} %"),
+            ("FWHM under the weight", "@fwhm{0.000} arcsec"),
+        ]
         self.xi = CorrelationPicture("Correlation of adaptive g")
         self.pictures = (self.whiskers, self.xi)
         self.stack = Select(title="Visits in the stack", value=self.visits, options=list(bench.stacks))

@@ -13,7 +13,7 @@ from .telescope import VACUUM, Telescope
 
 
 def ideal_telescope(telescope: Telescope, focal_ratio: float = 1000.0) -> Telescope:
-    """Return a telescope with the same pupil and negligible aberrations: one slow paraboloid, in vacuum.
+    """Return a telescope with a pupil of the same size and negligible aberrations: one slow paraboloid in vacuum.
 
     Obstructions stay that block light on its way to the first surface.
     At f/N (`focal_ratio`) its coma, 3 theta / (16 N^2), and its astigmatism, theta^2 / (2 N), blur a star at an angle
@@ -37,10 +37,10 @@ def ideal_telescope(telescope: Telescope, focal_ratio: float = 1000.0) -> Telesc
         stop_z=0.0,
         launch_distance=1.5 * length,
         reference_sphere_radius=length,
+        medium_before=VACUUM,
         groups={},
         group_frames={},
         camera=None,
-        medium_before=VACUUM,
         object_distance=math.inf,
         obstructions=tuple(replace(o, before=("M1",)) for o in obstructions),
         # Stop, fields and links are those of the surfaces that are gone.

@@ -37,6 +37,7 @@ from ..models.io.camera_file import is_camera
 from ..reconstruction.psf_model.recipe import INTERPOLATIONS, BasisName, InterpolationName, Recipe, RecipeName, names_of
 from ..reconstruction.psf_model.retired_process import GaussianProcess
 from ..wavefront.psf.engines import EngineName
+from .named_files import read_run
 
 _Model = TypeVar("_Model", bound=Section)
 #: Values of the height budget that a resolved configuration has without their being given.
@@ -435,7 +436,7 @@ def with_run(content: dict[str, Any], path: Path) -> dict[str, Any]:
     """
     run = content.get("run", {})
     if isinstance(run, str):
-        run = read_mapping(path.parent / run, ConfigError)
+        run = read_run(path.parent / run, path.parent)
     return {**content, "run": run}
 
 

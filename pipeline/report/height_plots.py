@@ -19,6 +19,8 @@ from ...models.camera.height_statistics import height_statistics, sampled_height
 _COLOURS = (RED, BLUE, ORANGE, PURPLE, GREY)
 # Pixels of the map along a side.
 _SAMPLES = 700
+# Widths of the heights of a CCD up to which there is a bin for each micrometre [um].
+_WIDTHS = 59.0
 # Percentile of |height| at the ends of the scale of the map: a few corners go far beyond.
 _SCALE = 99.0
 
@@ -39,18 +41,20 @@ def vendor_heights_plot(focal_plane: FocalPlane, title: str) -> Figure:
             _draw_borders(axes, camera)
         axes.set_title(plain_text(title))
         statistics = height_statistics(focal_plane)
-        edge = float(np.ceil(np.nanpercentile(np.abs(heights), 99.8)))
+        edge = max(float(np.ceil(np.nanpercentile(np.abs(heights), 99.8))), 1.0)
+        widths = np.ptp(np.nanpercentile(heights, (2.5, 97.5), axis=1), axis=0)
+        # Micrometres, or as many as reach to the widest.
+        width_bins = list(np.linspace(0.0, max(_WIDTHS, float(np.nanmax(widths))), round(_WIDTHS) + 1))
         for name, of in groups.items():
             row, colour = statistics[name], colours[name]
             label = f"{name.upper()}: {counted(row.n_ccd, 'CCD')}, rms {row.rms * 1e6:.1f} µm"
             bins = list(np.linspace(-edge, edge, 81))
             upper.hist(heights[of].ravel(), bins, density=True, histtype="step", color=colour, lw=1.4, label=label)
-            within = np.ptp(np.nanpercentile(heights[of], (2.5, 97.5), axis=1), axis=0)
-            label = f"{name.upper()}: median {np.median(within):.1f} µm"
-            lower.hist(within, list(range(60)), histtype="step", color=colour, lw=1.4, label=label)
+            label = f"{name.upper()}: median {np.median(widths[of]):.1f} µm"
+            lower.hist(widths[of], width_bins, histtype="step", color=colour, lw=1.4, label=label)
         upper.set(xlabel="height [µm]", ylabel="density [1/µm]", xlim=(-edge, edge))
         lower.set(xlabel="width of the middle 95 % of the heights of a CCD [µm]", ylabel="CCDs")
-        lower.set_xlim(0.0, 1.05 * max(np.ptp(np.nanpercentile(heights, (2.5, 97.5), axis=1), axis=0)))
+        lower.set_xlim(0.0, max(1.05 * float(np.nanmax(widths)), 1.0))
         for panel in (upper, lower):
             panel.margins(y=0.25)
             panel.autoscale(axis="y")

@@ -49,7 +49,8 @@ class Alignment(Result):
     expected : ndarray, shape [n_visit]
         Expected rms of the wavefront over the field that misalignment adds [m].
     floor : float
-        The same for a loop that has run for long: drift of one visit, photons and turbulence [m].
+        The same for a loop that has run for long: drift of one visit, turbulence and photons, those of each donut where
+        it was last used [m].
     donuts : ndarray of int, shape [n_visit]
         Donuts that were used.
     first, last : VisitRecord
@@ -121,7 +122,7 @@ def align(
     covariance = errors.initial**2 * np.eye(n)
     state = errors.initial * _normals(config.seed, "initial", 0, n)
     quality, states, estimates, spreads, expected, used, fits = [], [], [], [], [], [], []
-    noise = scene.turbulence
+    photons = np.full((len(scene.stars), len(NOLL), len(NOLL)), np.nan)
     # Bytes must not depend on how BLAS shares sums among threads.
     with one_blas_thread(), reporter.stage("visits", config.visits) as stage:
         for visit in range(config.visits):
@@ -137,7 +138,8 @@ def align(
             expected.append(scene.expected_wavefront(covariance))
             spreads.append(np.sqrt(np.diag(covariance)))
             rows = np.repeat(record.usable, len(NOLL))
-            noise = scene.turbulence + _photon_noise(record)
+            photons[record.usable] = record.covariance[record.usable]
+            noise = scene.turbulence + _photon_noise(record.covariance)
             estimate = estimate_state(
                 record.zernikes.ravel()[rows],
                 noise[np.ix_(rows, rows)],
@@ -157,8 +159,10 @@ def align(
             stage.advance()
             stage.step(f"visit {visit}: {1e9 * quality[-1].added:.0f} nm added", visit + 1, config.visits)
     start = errors.initial**2 * np.eye(n)
+    rows = np.repeat(np.isfinite(photons).all(axis=(1, 2)), len(NOLL))
+    noise = (scene.turbulence + _photon_noise(photons))[np.ix_(rows, rows)]
     with one_blas_thread():
-        steady = steady_covariance(np.nan_to_num(noise), scene.sensitivity, start, drift, config.control.gain, _STEADY)
+        steady = steady_covariance(noise, scene.sensitivity[rows], start, drift, config.control.gain, _STEADY)
     return Alignment(
         scene=scene,
         designed=scene.quality.means(scene.telescope, threads),
@@ -178,10 +182,10 @@ def _normals(seed: int, what: str, visit: int, count: int) -> np.ndarray:
     return stream(seed, "alignment", what, visit).standard_normal(count)
 
 
-def _photon_noise(found: VisitRecord) -> np.ndarray:
-    """Return the covariance of the Zernikes of all donuts by photons [m^2], shape [n_data, n_data]."""
-    n_star, n_noll = found.zernikes.shape
+def _photon_noise(covariance: np.ndarray) -> np.ndarray:
+    """Return the covariance of the Zernikes of all donuts [m^2], [n_data, n_data], from those of each by photons."""
+    n_star, n_noll, _ = covariance.shape
     out = np.zeros((n_star, n_noll, n_star, n_noll))
     for star in range(n_star):
-        out[star, :, star] = found.covariance[star]
+        out[star, :, star] = covariance[star]
     return out.reshape(n_star * n_noll, -1)

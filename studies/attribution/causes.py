@@ -36,7 +36,7 @@ def _flat_heights(config: Configuration) -> str | None:
 
 
 def _no_heights(config: Configuration) -> str | None:
-    if config.focal_plane.heights is not None:
+    if config.focal_plane.heights is not None or config.focal_plane.moved:
         return None
     return _flat_heights(config) or (None if config.focal_plane.terms else "all terms of focal_plane are off already")
 
@@ -45,6 +45,10 @@ def _no_term(term: str, config: Configuration) -> str | None:
     if config.focal_plane.heights is not None:
         return f"focal_plane.heights = {config.focal_plane.heights}, which has no terms"
     return _flat_heights(config) or (None if term in config.focal_plane.terms else f"focal_plane.{term} = false")
+
+
+def _no_active_optics(config: Configuration) -> str | None:
+    return None if config.active_optics.states is not None else _off("active_optics.residual_um", config)
 
 
 def _no_atmosphere(config: Configuration) -> str | None:
@@ -78,16 +82,18 @@ def _cause(key: str, value: float | bool | None) -> Cause:
     return Cause({key.replace(".", "__"): value}, partial(_off, key))
 
 
-#: All causes by name: terms of the CCD heights and all of them, residual aberration, the whole telescope, turbulence
-#: with refraction, the ground layer in common to all stars, charge diffusion, the depth at which silicon absorbs light,
-#: sensor effects, and noise.
+#: All causes by name: terms of the CCD heights, all of them with motions of rafts and CCDs, residual aberration with
+#: states of the telescope, the whole telescope, turbulence with refraction, the ground layer in common to all stars,
+#: charge diffusion, the depth at which silicon absorbs light, sensor effects, and noise.
 CAUSES: dict[str, Cause] = {
     **{
         term: Cause({f"focal_plane__{term}": False}, partial(_no_term, term))
         for term in ("global", "raft", "ccd", "tilt", "potato_chip")
     },
-    "heights": Cause({"focal_plane__heights": None, "focal_plane__budget": "flat"}, _no_heights),
-    "active_optics": _cause("active_optics.residual_um", 0.0),
+    "heights": Cause(
+        {"focal_plane__heights": None, "focal_plane__budget": "flat", "focal_plane__moved": {}}, _no_heights
+    ),
+    "active_optics": Cause({"active_optics__residual_um": 0.0, "active_optics__states": None}, _no_active_optics),
     OPTICS: Cause({}, partial(_off, "atmosphere.enabled", consequence=", nothing would be left")),
     "atmosphere": Cause({"atmosphere__enabled": False}, _no_atmosphere),
     "ground_layer": Cause({"atmosphere__ground_lift_m": GROUND_LIFT}, _no_ground_layer),

@@ -231,7 +231,11 @@ def _measured_metrics(
         try:
             values = {key: value for key, value in group.compute(scene).items() if np.isfinite(value)}
             metrics = {key: group.metric(key) for key in values}
-            measurements |= {key: (v, metrics[key].tolerance_of(scene, v), metrics[key]) for key, v in values.items()}
+            of_angles = scene.telescope.design_data.afocal
+            measurements |= {
+                key: (v, m.tolerance_of(scene, v), m.in_angles if of_angles else m)
+                for (key, v), m in zip(values.items(), metrics.values(), strict=True)
+            }
         except PachonError as error:
             problems[name] = str(error)
         if progress is not None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
+from ...core.units import angular
 from .scene import Scene
 
 #: Reasons of the tolerances.
@@ -22,6 +23,8 @@ REASONS = {
 }
 S = TypeVar("S")  #: kind of scene from which a table computes its metrics
 _PER_METRE = {"m": 1.0, "mm": 1e3, "um": 1e6, "nm": 1e9}
+#: Units of what is an angle where the image is at infinity; wavefronts stay in nanometres.
+_ANGULAR = {"m": "", "mm": "mrad", "um": "urad", "1/mm": "1/mrad"}
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,11 @@ class Metric:
     #: In the unit, or a function of scene and value; for lengths by default ``Scene.length_tolerance``.
     tolerance: float | Callable[[Scene, float], float] | None = None
     meaning: str = ""  #: definition, as reports and tables state it; a clause without a full stop
+
+    @property
+    def in_angles(self) -> Metric:
+        """The same of afocal telescopes, whose images are at infinity: radians in place of metres."""
+        return replace(self, name=angular(self.name), unit=_ANGULAR.get(self.unit, self.unit))
 
     def tolerance_of(self, scene: Scene, value: float) -> float:
         """Return the tolerance of a value, in its unit."""
@@ -70,7 +78,8 @@ class MetricTable(dict[str, MetricGroup[S]], Generic[S]):
 
     def metric(self, name: str) -> Metric | None:
         """Return the metric of a value: of those whose names start its own, the longest; None where there is none."""
-        matching_metrics = [m for group in self.values() for m in group.metrics if name.startswith(m.name)]
+        metrics = [m for group in self.values() for m in group.metrics]
+        matching_metrics = [m for m in (*metrics, *(m.in_angles for m in metrics)) if name.startswith(m.name)]
         return max(matching_metrics, key=lambda m: len(m.name), default=None)
 
 

@@ -14,7 +14,7 @@ from ...core.errors import ConfigError, DomainError, unknown_name
 from ...core.schema import Positive, Real, Section
 from ...design.metrics.distortion import Distortion, distortion
 from ...measure.adaptive_moments import AdaptiveMoments, adaptive_moments
-from ...measure.correlation import Correlation, shear_correlation
+from ...measure.correlation import Correlation, SeparationBins, shear_correlation
 from ...measure.shapes import Shapes, measure_shapes
 from ...models.telescope import Telescope
 from ...pipeline.experiment import Experiment
@@ -183,11 +183,14 @@ class Scene:
         """Correlation of g of the adaptive moments of the noise-free stars, over all CCDs."""
         return self._correlation_of(self.adaptive.g1, self.adaptive.g2)
 
+    @cached_property
+    def bins(self) -> SeparationBins:
+        """Bins of these correlations, of which only the number depends on the stars."""
+        return bins_up_to(float(np.hypot(*np.ptp(self.stars.fields, axis=0))))
+
     def _correlation_of(self, first: np.ndarray, second: np.ndarray) -> Correlation:
-        fields = self.stars.fields
-        x, y = to_detector_axes(fields.T, self.camera_experiment.rotator)
-        bins = bins_up_to(float(np.hypot(*np.ptp(fields, axis=0))))
-        return shear_correlation(x, y, first, second, bins=bins)
+        x, y = to_detector_axes(self.stars.fields.T, self.camera_experiment.rotator)
+        return shear_correlation(x, y, first, second, bins=self.bins)
 
 
 def one_digit(value: float) -> float:

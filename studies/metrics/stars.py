@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...core.statistics import finite_mean, finite_median, rms
-from ...core.units import ARCSEC
+from ...core.units import ARCMIN, ARCSEC
 from ...design.images.encircled_energy import energy_curve
 from ...measure.correlation import SEPARATION_RANGES
 from ...measure.shapes import fwhm
@@ -184,14 +184,15 @@ def correlation_of_g(scene: Scene) -> dict[str, float]:
 
 @STARS.group(
     "xi_bins",
-    Metric("xi_plus", meaning="ellipticity correlation xi+ of the noise-free stars at that mean separation"),
-    Metric("xi_minus", meaning="ellipticity correlation xi- of the noise-free stars at that mean separation"),
+    Metric("xi_plus", meaning="ellipticity correlation xi+ of the noise-free stars in the bin about that separation"),
+    Metric("xi_minus", meaning="ellipticity correlation xi- of the noise-free stars in the bin about that separation"),
 )
 def correlation_bins(scene: Scene) -> dict[str, float]:
-    """Return xi+ and xi- of each bin of separation."""
-    xi = scene.correlation
-    plus = {f"xi_plus_{r:.3g}_arcmin": float(v) for r, v in zip(xi.r_arcmin, xi.xi_plus, strict=True)}
-    minus = {f"xi_minus_{r:.3g}_arcmin": float(v) for r, v in zip(xi.r_arcmin, xi.xi_minus, strict=True)}
+    """Return xi+ and xi- of each bin of separation, by its middle: mean separations vary with the stars."""
+    xi, edges = scene.correlation, np.geomspace(scene.bins.min_sep, scene.bins.max_sep, scene.bins.n_bins + 1) / ARCMIN
+    middles = [f"{middle:.3g}_arcmin" for middle in np.sqrt(edges[1:] * edges[:-1])]
+    plus = {f"xi_plus_{name}": float(v) for name, v in zip(middles, xi.xi_plus, strict=True)}
+    minus = {f"xi_minus_{name}": float(v) for name, v in zip(middles, xi.xi_minus, strict=True)}
     return plus | minus
 
 

@@ -112,14 +112,14 @@ def load_night_configuration(path: Path) -> NightConfig:
 
 
 def read_section(settings: ListSection, run: Configuration, folder: Path | None = None) -> VisitList:
-    """Read the list of a section for the telescope of a run; a relative path starts from `folder`.
+    """Read the list of a section for the telescope of a run; relative paths of both start from `folder`.
 
     PachonError if it cannot be read, or its visits are not those of the digest.
     """
     path = (folder or Path()) / str(settings.list)
     camera = run.camera or ("comcam" if "comcam" in (run.telescope or "") else "lsst")
     selection = settings.where, settings.band, settings.night
-    visits = _visits_of(path, _state_of(path), selection, camera, _site_of(run), settings.airmass_law)
+    visits = _visits_of(path, _state_of(path), selection, camera, _site_of(run, folder), settings.airmass_law)
     if settings.digest not in (None, visits.digest):
         raise ProductError("the list has changed: expected the visits of the digest of the configuration", file=path)
     return visits
@@ -144,12 +144,16 @@ def _state_of(path: Path) -> tuple[int, int] | None:
     return status.st_mtime_ns, status.st_size
 
 
-def _site_of(run: Configuration) -> str:
-    """Return the bundled site of a run's telescope."""
+def _site_of(run: Configuration, folder: Path | None) -> str:
+    """Return the bundled site of a run's telescope, or the path of a site file."""
     from ...models.io.prescription import load_telescope
 
+    def from_folder(name: str) -> str:
+        path = (folder or Path()) / name
+        return str(path) if path.is_file() else name
+
     if run.atmosphere.site is not None:
-        return run.atmosphere.site
+        return from_folder(run.atmosphere.site)
     if run.telescope is None:
         return "cerro_pachon"
-    return load_telescope(run.telescope).site or "cerro_pachon"
+    return load_telescope(from_folder(run.telescope)).site or "cerro_pachon"

@@ -119,8 +119,9 @@ def study(config: Configuration, plan: Plan, *, threads: int | None = None, repo
                 # Principal components do not depend on how many are kept: one fit for all of these numbers.
                 for _, group in groupby(sorted(snr_cases, key=_fit_key), key=_fit_key):
                     together = list(group)
+                    most = max(together, key=lambda case: case.components)
                     try:
-                        models = _models_of_ccds(together[-1], experiment, ccds, observed, threads)
+                        models = _models_of_ccds(most, experiment, ccds, observed, threads)
                         for case in together:
                             residuals = measure_residuals(experiment, case, ccds, observed, models, threads)
                             samples[case].append(residuals)
@@ -158,7 +159,7 @@ def _models_of_ccds(
 
 
 def _fit_key(case: Case) -> tuple[Any, ...]:
-    """Return the sort key of a case: cases of one fit are adjacent, by their number of principal components."""
+    """Return the sort key of a case: cases of one fit are adjacent."""
     shared = case.basis in BASES and BASES[case.basis].ordered
     return (case.basis, case.interpolation, case.order, case.stars, 0 if shared else case.components)
 

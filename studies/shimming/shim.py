@@ -27,6 +27,7 @@ from ...models.camera.focal_plane import FocalPlane
 from ...pipeline.config import Configuration, MotionConfig
 from ...pipeline.experiment import Experiment
 from ...pipeline.report.focal_plane_plots import draw_heights
+from ...reconstruction.ccd_product import to_detector_axes
 from ...reconstruction.focal_plane_psf.height_series import HeightSeries
 from ...wavefront.chief_rays import fields_at
 from .curves import E, G, Places, T, focus_curves, measured
@@ -206,9 +207,10 @@ def shim(
 
 
 def _field_angles(experiment: Experiment, places: Places, threads: int | None) -> np.ndarray:
-    """Return the field angles of places [rad], shape [n, 2]."""
+    """Return the field angles of places [rad], shape [n, 2], along the axes of the detector, as ellipticities are."""
     middle = experiment.wavelengths[len(experiment.wavelengths) // 2]
-    return fields_at(experiment.telescope, places.position, middle, threads=threads)
+    fields = fields_at(experiment.telescope, places.position, middle, threads=threads)
+    return to_detector_axes(fields.T, experiment.rotator).T
 
 
 def _separation_bins(plane: FocalPlane, positions: np.ndarray, sky: np.ndarray) -> np.ndarray:

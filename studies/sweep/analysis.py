@@ -53,6 +53,8 @@ class Budget:
     #: Change with all effects at once, and its standard error; NaN where it was not computed.
     together: float
     together_error: float
+    #: Standard error of the sum less that change, which replicas have in common; NaN with one replica.
+    difference_error: float
 
 
 @dataclass(frozen=True)
@@ -110,14 +112,16 @@ def budget(table: SweepTable, sweep: SweepFile, metric: str, mark: str) -> Budge
     if not alone:
         return None
     nominal = {name: p.nominal for name, p in sweep.parameters.items()}
-    changes = []
+    changes, differences = [], []
     for seed in np.unique(table.seed):
-        with_all = _metric_at(table, {**nominal, **marked}, seed, metric)
         without = _metric_at(table, nominal, seed, metric)
-        changes.append(with_all - without)
+        changes.append(_metric_at(table, {**nominal, **marked}, seed, metric) - without)
+        single = [_metric_at(table, {**nominal, name: marked[name]}, seed, metric) - without for name in alone]
+        differences.append(sum(single) - changes[-1])
     together, _, error = (float(v[0]) for v in _over_replicas(np.array(changes)[:, None]))
+    difference_error = float(_over_replicas(np.array(differences)[:, None])[2][0])
     ordered = dict(sorted(alone.items(), key=lambda item: -abs(item[1])))
-    return Budget(metric, mark, ordered, float(sum(alone.values())), together, error)
+    return Budget(metric, mark, ordered, float(sum(alone.values())), together, error, difference_error)
 
 
 def allowances(metric_curves: Sequence[Curve], target: float) -> list[Allowance]:

@@ -34,6 +34,7 @@ from ...core.set_keys import set_key_errors, set_keys
 from ...core.yaml_reader import read_mapping
 from ...models.io.prescription import prescription_digest
 from ...pipeline.config import digest
+from ...pipeline.named_files import FILES, read_run, with_named_files, with_path
 
 #: Values of the parameters of one point by name.
 Point = dict[str, Any]
@@ -81,10 +82,8 @@ class Design(Section):
     )
 
 
-#: Sections and keys of a configuration that may name a file, besides the telescope.
-_FILES = (("atmosphere", "site"), ("focal_plane", "heights"), ("active_optics", "states"), ("stars", "catalogue"))
 # Parameters whose values may name files.
-_FILE_PARAMETERS = {"telescope", "camera", *(f"{section}.{key}" for section, key in _FILES)}
+_FILE_PARAMETERS = {f"{section}.{key}" if section else key for section, key in FILES}
 
 
 class SweepFile(Section):
@@ -111,9 +110,8 @@ class SweepFile(Section):
         telescope = None
         if isinstance(self.base, dict):
             telescope = self.base.get("telescope")
-            named.append(self.base.get("camera"))
-            for section, key in _FILES:
-                content = self.base.get(section)
+            for section, key in FILES[1:]:
+                content = self.base.get(section) if section else self.base
                 named.append(content.get(key) if isinstance(content, dict) else None)
         for name in _FILE_PARAMETERS - {"telescope"}:
             named += self._values(name)
@@ -145,26 +143,15 @@ def load_sweep(path: str | os.PathLike[str], settings: Sequence[str] = ()) -> Sw
     path = Path(path)
     content = read_mapping(path, ConfigError)
     if isinstance(content.get("base"), str):
-        content["base"] = read_mapping(path.parent / content["base"], ConfigError)
+        content["base"] = read_run(path.parent / content["base"], path.parent)
     content = set_keys(SweepFile, content, settings)
     folder = path.parent
-    content["design"] = _with_path(content.get("design", {}), "file", folder)
-    base = _with_path(_with_path(content.get("base", {}), "telescope", folder), "camera", folder)
-    for section, key in _FILES:
-        if isinstance(base, dict) and section in base:
-            base = {**base, section: _with_path(base[section], key, folder)}
-    content["base"] = base
+    content["design"] = with_path(content.get("design", {}), "file", folder)
+    content["base"] = with_named_files(content.get("base", {}), folder)
     with set_key_errors(settings):
         sweep = read_sweep(content, str(path))
     sweep._folder = folder
     return sweep
-
-
-def _with_path(section: Any, key: str, folder: Path) -> Any:
-    """Return a section with the absolute path of a file that a key names relative to a folder."""
-    if isinstance(section, dict) and isinstance(section.get(key), str) and (folder / section[key]).is_file():
-        return {**section, key: str((folder / section[key]).resolve())}
-    return section
 
 
 def read_sweep(content: dict[str, Any], source: str) -> SweepFile:

@@ -117,9 +117,8 @@ def _budget_text(budgets: list[Budget]) -> str:
         if np.isfinite(effects.together) and effects.total:
             apart = abs(effects.together - effects.total)
             # Equal within two standard errors, or a tenth for one replica.
-            same = apart < (
-                2.0 * effects.together_error if np.isfinite(effects.together_error) else 0.1 * abs(effects.total)
-            )
+            limit, rounding = 2.0 * effects.difference_error, 1e-9 * abs(effects.total)
+            same = apart <= (max(limit, rounding) if np.isfinite(limit) else 0.1 * abs(effects.total))
             texts.append(
                 f"{effects.mark}: single effects sum to {with_digits(effects.total, effects.together_error)}, all at "
                 f"once make {with_error(effects.together, effects.together_error)}: "

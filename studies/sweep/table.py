@@ -20,6 +20,7 @@ from ...core.products import Columns, described_table
 from ...core.result import Result
 from ...core.schema import key_description
 from ...core.table_files import write_table
+from ...models.parameters.changes import ANGLES, LENGTHS
 from ...pipeline.config import Configuration
 from ..metrics.stars import STARS
 from ..metrics.telescope import TELESCOPE_METRICS
@@ -36,7 +37,7 @@ _CHANGES = {
     **{f"d{axis}": f"shift along {axis}" for axis in "xyz"},
     **{f"r{axis}": f"tilt about {axis}" for axis in "xyz"},
 }
-_UNITS = ("um", "nm", "mm", "m", "urad", "rad", "deg", "arcsec", "s")
+_UNITS = (*LENGTHS, *ANGLES, "s")
 
 
 @dataclass(frozen=True)

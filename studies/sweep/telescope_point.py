@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import ConfigError, unknown_name
+from ...core.units import angular
 from ...models.io.bundled import BUNDLED
-from ...models.io.prescription import load_telescope
+from ...models.io.prescription import load_telescope, prescription_digest
 from ...models.parameters.changes import apply_changes, parse_change
 from ...models.telescope import Telescope
 from ...pipeline.config import Configuration, configuration_of
@@ -30,7 +31,10 @@ def has_no_camera(sweep: SweepFile, parameters: Point, folder: Path) -> bool:
     """Return whether the telescope of a point has no camera."""
     base = sweep.base if isinstance(sweep.base, dict) else {}
     name = parameters.get("telescope", base.get("telescope"))
-    return isinstance(name, str) and _without_camera(_path(name, folder))
+    if not isinstance(name, str):
+        return False
+    path = telescope_path(name, folder)
+    return _without_camera(path, prescription_digest(path) if Path(path).is_file() else "")
 
 
 def point_metrics(sweep: SweepFile, parameters: Point, folder: Path, threads: int) -> dict[str, float]:
@@ -45,6 +49,8 @@ def point_metrics(sweep: SweepFile, parameters: Point, folder: Path, threads: in
     metrics: dict[str, float] = {}
     for name in dict.fromkeys(sweep.metrics):
         metrics |= TELESCOPE_METRICS[name].compute(scene)
+    if telescope.design_data.afocal:
+        metrics = {angular(name): value for name, value in metrics.items()}
     return metrics | {f"solved {name}": value for name, value in solved.items()}
 
 
@@ -60,7 +66,7 @@ def point_telescope(sweep: SweepFile, parameters: Point, folder: Path) -> tuple[
         if key not in KEYS:
             raise ConfigError(f"base.{key}: expected {', '.join(KEYS)} alone, for a telescope without a camera")
     config = configuration_of(content, f"sweep {sweep.name}")
-    telescope = load_telescope(_path(config.telescope or "", folder))
+    telescope = load_telescope(telescope_path(config.telescope or "", folder))
     return apply_changes(telescope, config.changes), config
 
 
@@ -76,10 +82,13 @@ def check_telescope_sweep(sweep: SweepFile, parameters: Point, folder: Path) -> 
         telescope.check_field(*np.deg2rad(sweep.fields_deg).T)
 
 
-def _path(name: str, folder: Path) -> str:
+def telescope_path(name: str, folder: Path) -> str:
+    """Return a bundled name as it is, and the path of a file from a folder."""
     return name if name in BUNDLED or not (folder / name).is_file() else str(folder / name)
 
 
 @lru_cache(maxsize=64)
-def _without_camera(path: str) -> bool:
+def _without_camera(path: str, digest: str) -> bool:
+    """Return whether the telescope in a file of that digest has no camera: points of a sweep share the answer."""
+    del digest  # part of the key
     return load_telescope(path).camera is None

@@ -42,14 +42,18 @@ def test_maps_are_the_predictions_of_the_model(model):
     shapes, sigma = model.shapes(names, x, y), model.uncertainty(names, x, y)
     view = bench.whiskers()
     np.testing.assert_allclose(view.e1, shapes.e1, rtol=1e-12)
-    np.testing.assert_allclose(view.fwhm_arcsec, RMS_TO_FWHM * shapes.size / ARCSEC, rtol=1e-12)
+    # That of the stars, not the smaller one of their light under the weight.
+    np.testing.assert_allclose(view.fwhm_arcsec, 0.6, rtol=5e-3)
     np.testing.assert_array_equal((view.x_mm, view.y_mm), (1e3 * x, 1e3 * y))
     # e1 of the stars grows with y: by about its half within the weight.
     assert np.corrcoef(view.e1, view.y_mm)[0, 1] > 0.99
     expected = 100 * np.sqrt((sigma.e1**2 + sigma.e2**2) / 2)
     np.testing.assert_allclose(bench.map("uncertainty of e").value, expected, rtol=1e-12)
-    expected = RMS_TO_FWHM * sigma.size / ARCSEC
-    np.testing.assert_allclose(bench.map("uncertainty of FWHM").value, expected, rtol=1e-12)
+    larger, smaller = (
+        RMS_TO_FWHM * np.sqrt(1.0 / (1.0 / size**2 - (RMS_TO_FWHM / (0.7 * ARCSEC)) ** 2)) / ARCSEC
+        for size in (shapes.size + 1e-3 * sigma.size, shapes.size - 1e-3 * sigma.size)
+    )
+    np.testing.assert_allclose(bench.map("uncertainty of FWHM").value, (larger - smaller) / 2e-3, rtol=1e-6)
     np.testing.assert_array_equal(bench.map("FWHM").value, view.fwhm_arcsec)
     assert bench.heights() is None
 
@@ -80,7 +84,7 @@ def test_a_click_draws_the_psf_there(model, tmp_path):
     shapes, _ = session.bench.predicted
     assert f">{100 * shapes.e1[3]:.4g}</b>" in session.table.text
     session.map.value = "FWHM"
-    np.testing.assert_array_equal(session.field.source.data["value"], RMS_TO_FWHM * shapes.size / ARCSEC)
+    np.testing.assert_array_equal(session.field.source.data["value"], session.bench.fwhm)
     # Without stamps and telescope there is no image, and one line says so.
     session = FocalSession(FocalBench("model", fitted(stamps=False)))
     assert not session.psf.figure.visible

@@ -33,7 +33,7 @@ def drawn():
     return pachon.monte_carlo(pachon.paul_baker(), tolerances, "wavefront", **options)
 
 
-def tolerance_folder(folder):
+def tolerance_folder(folder, upper_ends=(8.0, 5.25), costs=(3.0, 0.5)):
     """Write the tables of a study of two tolerances of a triplet, one draw of which loses its light."""
     folder.mkdir()
     (folder / "summary.json").write_text(
@@ -45,7 +45,7 @@ def tolerance_folder(folder):
     draws["Image.dz_um (compensator)"] = [1.0, 2.0, 3.0] * u.um
     draws["L2.dy_um"], draws["S1.conic"] = [10.0, -20.0, 0.0] * u.um, [0.1, 0.2, -0.1]
     draws.write(folder / "draws.ecsv")
-    ends = {"lower_end": [6.0, 5.5] * u.um, "upper_end": [8.0, 5.25] * u.um}
+    ends = {"lower_end": [6.0, 5.5] * u.um, "upper_end": upper_ends * u.um, "cost": costs * u.um}
     sizes = {"size": [20.0, 0.2], "unit": ["um", "1"]}
     QTable({"name": ["L2.dy_um", "S1.conic"], **sizes, **ends}).write(folder / "sensitivity.ecsv")
     return folder
@@ -116,6 +116,12 @@ def test_the_folder_of_tolerances_has_the_changes_at_both_ends(tmp_path):
     assert view.axis == "change of spots, the tolerance alone [um]"
     assert list(bench.parameters) == ["L2.dy_um", "S1.conic", "Image.dz_um (compensator)"]
     assert bench.numbers("spots", [])["spots, largest"] == (6.5, "um")
+
+
+def test_a_tolerance_that_loses_the_light_is_the_costliest(tmp_path):
+    bench = ToleranceBench.read(tolerance_folder(tmp_path / "tolerance", (8.0, np.nan), (3.0, np.inf)))
+    assert list(bench.parameters) == ["S1.conic", "L2.dy_um", "Image.dz_um (compensator)"]
+    assert bench.tornado("spots").parameters == ("L2.dy_um", "S1.conic")
 
 
 def test_a_table_of_donuts_has_their_zernikes(tmp_path):

@@ -12,10 +12,22 @@ import pachon
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, PachonError, UnknownNameError
 from pachon.desk.bench import Bench
+from pachon.desk.design_views import SPOTS, sensitivity_view
 from pachon.desk.python_text import python_text
 from pachon.desk.state import DeskState, History, is_state_file
-from pachon.desk.views import Scene, WhiskersView, layout_of, numbers, opd_view, section_view, spots_view, whiskers_view
+from pachon.desk.views import (
+    Scene,
+    WhiskersView,
+    images_view,
+    layout_of,
+    numbers,
+    opd_view,
+    section_view,
+    spots_view,
+    whiskers_view,
+)
 from pachon.models import OpticsState
+from pachon.models.design_data import DesignData
 from pachon.wavefront.psf.stamps import Stamps
 
 BENCH = Bench("lsst_v3.3_r")
@@ -138,6 +150,44 @@ def test_whiskers_are_the_moments_of_the_stars_on_their_ccds():
     assert "rays" in whiskers_view(Scene.of(BENCH, far)).method
 
 
+def test_a_star_whose_annulus_misses_the_detector_has_zernikes_of_its_lit_part():
+    """At the rim of the field of HSC the wavefront of the star before stayed in the picture."""
+    bench = Bench("hsc")
+    x, y = np.rad2deg(bench.spot_fields[0])
+    scene = Scene.of(bench, replace(bench.start, field_deg=(x, y)))
+    request = pachon.Request.of(bench.nominal, scene.field[None], scene.wavelength)
+    with pytest.raises(DomainError, match="rays of the annulus miss the detector"):
+        pachon.wavefront_zernikes(request, jmax=22)
+    lit = pachon.wavefront_zernikes(request, jmax=22, pupil="lit").coefficients[0, 3:]
+    np.testing.assert_allclose(opd_view(scene).zernikes_nm, 1e9 * lit, rtol=1e-9)
+
+
+def test_encircled_energy_is_of_all_light_not_of_that_on_the_stamp():
+    scene = Scene.of(BENCH, replace(BENCH.start, seeing_arcsec=2.0))
+    stamps = Stamps.of_camera("lsst", size=101)
+    wide = pachon.make_psfs(
+        scene.telescope, scene.field[None], scene.wavelength,
+        atmosphere=scene.atmosphere, engine="long_exposure", stamps=stamps,
+    )  # fmt: skip
+    y, x = np.mgrid[-50:51, -50:51]
+    order = np.argsort(np.hypot(x, y), axis=None)
+    within = wide.inside[0] * np.cumsum(wide.image[0].ravel()[order])
+    radius = np.hypot(x, y).ravel()[order][np.searchsorted(within, 0.8)] * np.rad2deg(wide.pixel_scale) * 3600
+    found, _ = numbers(None, None, None, images_view(scene))["80 % of the light at the star within"]
+    # Rings of pixels are a tenth of an arcsecond wide.
+    assert found == pytest.approx(radius, abs=0.05)
+
+
+def test_widths_of_stars_are_not_those_of_a_weight():
+    # The 0.3 arcsec weight of stars without air is the width of none that is larger; and many have no moments under it.
+    states = [replace(BENCH.start, seeing_arcsec=0.0, optics={"M2_dz": dz}) for dz in (0.0, 40.0, 80.0, 120.0)]
+    widths = [np.median(whiskers_view(Scene.of(BENCH, state)).fwhm_arcsec) for state in states]
+    assert 0.2 < widths[0] < 0.3
+    assert widths[1:] == sorted(widths[1:])
+    # Widths of a star out of focus grow with the distance from it.
+    assert widths[3] / widths[2] == pytest.approx(120.0 / 80.0, rel=0.02)
+
+
 def test_whiskers_have_the_angle_and_length_of_the_ellipticity():
     e, angle = 0.1, np.deg2rad(30.0)
     components = (e * np.cos(2.0 * angle), e * np.sin(2.0 * angle))
@@ -153,6 +203,16 @@ def test_the_section_names_every_surface_with_its_radius():
     assert set(BENCH.nominal.surface_names) <= set(pieces)
     assert pieces["M1"].text == f"radius {BENCH.nominal.surface('M1').shape.parameters['radius']:.6g} m, mirror"
     assert pieces["L1"].glass
+
+
+def test_spots_at_infinity_are_in_angles():
+    bench = Bench(replace(pachon.load_telescope("lsst_v3.3_r"), camera=None, design_data=DesignData(afocal=True)))
+    scene = Scene.of(bench, bench.start)
+    view = spots_view(scene)
+    assert sensitivity_view(scene, SPOTS).unit == "urad"
+    table = numbers(view, None, None, None)
+    assert [table[f"spot rms radius, {name}"][1] for name in ("median", "largest")] == ["urad", "urad"]
+    assert "[urad]" in python_text(bench, bench.start)
 
 
 def test_light_that_does_not_arrive_is_one_line():
@@ -171,6 +231,15 @@ def test_the_python_program_prints_the_numbers_of_the_desk(state, capsys, tmp_pa
     view = opd_view(Scene.of(BENCH, state))
     np.testing.assert_allclose(names["zernikes"].coefficients[0, 3:] * 1e9, view.zernikes_nm, rtol=1e-9, atol=1e-6)
     assert "rms radius of the spot [um]" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["gregorian", "ritchey-chretien"])
+def test_whiskers_without_a_camera_stand_where_their_stars_land(kind):
+    """A Gregorian turns the sky by half a circle against a Cassegrain."""
+    telescope = pachon.new_telescope(kind)
+    places, fields = Bench(telescope).stars()
+    assert pachon.fields_at(telescope, places) == pytest.approx(fields, abs=1e-9)
+    assert np.sign(places[-1, 1]) == (-1.0 if kind == "gregorian" else 1.0) * np.sign(fields[-1, 1])
 
 
 @pytest.mark.long

@@ -29,7 +29,7 @@ def store_of(folder, **changes):
     """Return a store whose metric is a polynomial of the parameters; nothing is simulated."""
     sweep, path = read_sweep({**CONTENT, **changes}, "test"), folder / "motions.sweep"
     points = numbered_points(sweep, folder)
-    create_store(path, sweep, points, {})
+    create_store(path, sweep, points, {"folder": str(folder)})
     with SweepStore(path) as store:
         for point in points:
             metrics = {"fwhm_arcsec": metric_of(point.parameters), "rms_e": float(point.number)}
@@ -100,6 +100,19 @@ def test_a_point_of_another_kind_is_one_line(parameters, message, tmp_path, monk
     assert str(caught.value).startswith(f"point 1: {next(iter(parameters))}: ")
     with pytest.raises(DomainError, match=r"^point 99: expected one of the sweep, 0 to 1$"):
         bench.opened(99)
+
+
+def test_telescopes_of_points_are_those_beside_the_sweep(tmp_path, monkeypatch):
+    """Wherever the desk is opened."""
+    monkeypatch.setitem(globals(), "metric_of", lambda point: 1.0)
+    (tmp_path / "files").mkdir()
+    thick = pachon.new_telescope("triplet", field_radius=0.1)
+    pachon.save_telescope(thick, tmp_path / "files" / "mine.yaml")
+    parameters = {"telescope": {"nominal": "mine.yaml", "values": ["mine.yaml"]}}
+    changes = {"parameters": parameters, "base": {}, "metrics": ["spots"]}
+    path = store_of(tmp_path / "files", **changes)
+    bench, _ = SweepBench(path).opened(0)
+    assert bench.nominal.surface_names == thick.surface_names
 
 
 def test_what_is_no_sweep_is_one_line(tmp_path):

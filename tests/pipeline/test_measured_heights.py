@@ -6,10 +6,12 @@ from astropy.table import Table
 
 from pachon.core.errors import ConfigError, PachonError
 from pachon.models.camera.focal_plane import FocalPlane
+from pachon.models.camera.height_budget import HeightBudget
 from pachon.models.camera.lsst import lsst_camera
 from pachon.pipeline.config import Configuration, load_configuration, to_yaml, with_options
 from pachon.pipeline.config_hash import hashed_heights
 from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.report.height_plots import vendor_heights_plot
 from pachon.studies.attribution.causes import checked_causes, without
 from pachon.studies.baseline.baseline import _input_stamps
 from pachon.studies.sweep.file import load_sweep
@@ -126,3 +128,18 @@ def test_measured_heights_are_a_cause_but_have_no_terms():
     assert flat.height(0.0, 0.0) == 0.0
     with pytest.raises(ConfigError, match=r"raft cannot be switched off: focal_plane\.heights = lsstcam"):
         checked_causes(config, ["raft"])
+
+
+@pytest.mark.long
+def test_distributions_of_heights_hold_every_ccd(monkeypatch):
+    """However much their surfaces differ: beyond 59 um none was counted."""
+    monkeypatch.setattr("pachon.pipeline.report.height_plots._SAMPLES", 10)
+    plane = FocalPlane.from_budget("lsst", seed=1, budget=HeightBudget(0.0, 0.0, 0.0, 5e-3, 0.0))
+    drawn = vendor_heights_plot(plane, "heights").axes[2]
+    counts = []
+    for patch in drawn.patches:
+        x, y = patch.get_xy().T
+        # Steps: each bin is as wide as it is high in CCDs, over its width.
+        counts.append(round(float(np.sum(0.5 * (y[1:] + y[:-1]) * np.diff(x))) / (max(x) / 59)))
+        assert max(x) >= drawn.get_xlim()[1] / 1.06
+    assert counts == [72, 117]

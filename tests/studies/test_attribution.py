@@ -207,6 +207,24 @@ def test_a_lifted_ground_layer_is_the_same_air(tiny):
     assert lifted.atmosphere.screens("slopes") is full.atmosphere.screens("slopes")
 
 
+def test_the_command_names_every_cause(capsys):
+    assert main(["attribute", "--help"]) == 0
+    words = set(capsys.readouterr().out.replace(",", " ").replace(";", " ").split())
+    assert words > set(CAUSES)
+
+
+def test_without_heights_or_active_optics_nothing_is_moved(tiny):
+    """Shims are motions of rafts: without the heights that they make up for, they would be heights themselves."""
+    for options in ({}, {"focal_plane__budget": "flat"}, {"focal_plane__heights": "lsstcam"}):
+        full = Experiment.from_config(tiny(focal_plane__moved={"R22": {"dz_um": 12.0}}, **options))
+        assert "heights" in checked_causes(full.config)
+        flat = without_cause(full, "heights").focal_plane
+        assert not flat.height(*flat.camera.centers.T).any()
+    misaligned = with_options(tiny(), active_optics__states="states.ecsv")
+    assert "active_optics" in checked_causes(misaligned)
+    assert without(misaligned, "active_optics").active_optics.states is None
+
+
 def test_causes_that_are_off_are_no_causes(tiny):
     config = tiny()
     assert checked_causes(config) == tuple(c for c in CAUSES if c not in ("active_optics", *OFF))

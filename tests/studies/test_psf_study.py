@@ -251,7 +251,8 @@ def test_plan_of_a_configuration(tiny):
 
 @pytest.fixture(scope="module")
 def small(tiny):
-    plan = make_plan(tiny(), stars=(6,), orders=(1, 3), components=(4,), snrs=(30.0,), draws=2)
+    # Fewer components than those of the base, with which one fit is made for both.
+    plan = make_plan(tiny(), stars=(6,), orders=(1, 3), components=(2,), snrs=(30.0,), draws=2)
     return plan, study(tiny(), plan, threads=1)
 
 

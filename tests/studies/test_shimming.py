@@ -173,6 +173,17 @@ def test_gains_are_in_order_and_checked_elsewhere(built, shims):
 
 
 @pytest.mark.long
+def test_correlations_are_along_the_axes_of_a_turned_camera(shims):
+    """The telescope is nearly the same in all directions, so that a turn of its camera changes no xi+ and no xi-."""
+    turned = shim(experiment_of(focal_plane__heights="lsstcam", rotator_deg=30.0), threads=1)
+    for state in ("as built", "focused"):
+        correlation, found = shims.correlations[state], turned.correlations[state]
+        largest = np.abs(correlation.xi_minus).max()
+        assert found.xi_minus == pytest.approx(correlation.xi_minus, abs=0.05 * largest)
+        assert found.xi_plus == pytest.approx(correlation.xi_plus, abs=0.05 * largest)
+
+
+@pytest.mark.long
 def test_the_configuration_with_the_shims_is_the_shimmed_focal_plane(built, shims):
     plain = with_options(built.config, focal_plane__moved={"R34": {"dz_um": 1.0}, "R22_S11": {"rx_urad": 5.0}})
     config = shimmed_configuration(plain, shims)

@@ -271,6 +271,8 @@ def test_command_line(finished_run, tmp_path, capsys, no_pictures):
     assert "at [arcmin]" in out
     assert "…" not in out
     assert out.endswith(f"diagnostics: {(tmp_path / 'b').resolve()}\n")
+    assert main(["diagnose", str(finished_run), "--out", str(tmp_path / "b"), "--quiet"]) == 0
+    assert capsys.readouterr().out == f"diagnostics: {(tmp_path / 'b').resolve()}\n"
     assert main(["diagnose", "--help"]) == 0
     assert "pachon diagnose " in capsys.readouterr().out.partition("Examples")[2]
 

@@ -99,6 +99,24 @@ def test_the_loop_converges_within_two_corrections_to_what_it_expects(aligned):
 
 
 @pytest.mark.long
+def test_donuts_without_a_result_do_not_lower_the_floor(aligned, traced_donuts, monkeypatch):
+    """Six of the eight in the last visit: their covariance is NaN, which is no perfect measurement."""
+    traced = loop.fit
+
+    def fit(scene, exposed, threads):
+        fitted = traced(scene, exposed, threads)
+        if exposed[1] == 1:
+            fitted.usable[:6] = False
+            fitted.zernikes[:6] = fitted.error_parts.photons[:6] = np.nan
+        return fitted
+
+    monkeypatch.setattr(loop, "fit", fit)
+    found = align(config(visits=2))
+    assert list(found.donuts) == [8, 2]
+    assert found.floor == aligned.floor
+
+
+@pytest.mark.long
 def test_bytes_do_not_depend_on_threads_or_later_visits(aligned, traced_donuts):
     again = align(config(visits=2), execution=Execution(threads=1))
     assert again.states.tobytes() == aligned.states[:2].tobytes()

@@ -10,12 +10,14 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS
 
+import pachon
 from pachon.commands.night import listed_visit
 from pachon.core.errors import ConfigError, DomainError, ProductError
 from pachon.core.long_work import Execution
 from pachon.core.products import read_fits
 from pachon.imaging.wcs import ccd_wcs
 from pachon.pipeline.listed_visit import check_bands, visit_experiment
+from pachon.studies.night.config import NightConfig
 from pachon.studies.night.maps import NightMaps
 from pachon.studies.night.night import run_night
 from pachon.studies.night.visit_product import VisitWork
@@ -257,3 +259,13 @@ def test_a_single_visit_may_have_a_model_of_the_focal_plane(night_config):
     with pytest.raises(ConfigError, match="expected ccd for visits of a list"):
         night.read_list()
     assert listed_visit(night.run, Path(night.visits.list), 1003, None, None, None).visit == 1003
+
+
+def test_files_beside_a_configuration_are_found_from_anywhere(night_config, tmp_path):
+    """The telescope of a run as well as the list: both tell where on the Earth the visits are."""
+    pachon.save_telescope(pachon.load_telescope("lsst_v3.3_r"), tmp_path / "mine.yaml")
+    shutil.copy(night_config().visits.list, tmp_path / "list.csv")
+    visits = {"list": "list.csv", "where": "observationId = 1003"}
+    night = NightConfig.model_validate({"run": {"telescope": "mine.yaml"}, "visits": visits})
+    assert len(night.read_list(tmp_path)) == 1
+    assert listed_visit(night.run, tmp_path / "list.csv", 1003, None, None, None, tmp_path).visit == 1003

@@ -10,11 +10,14 @@ import pachon
 from pachon.commands.cli import main
 from pachon.core.errors import PachonError
 from pachon.models.paraxial import following_pupil
+from pachon.studies.baseline.baseline import make_baseline
 from pachon.studies.metrics.telescope import TELESCOPE_METRICS, TelescopeScene
 from pachon.studies.sweep.analysis import summary, verdict
 from pachon.studies.sweep.file import read_sweep
 from pachon.studies.sweep.store import SweepStore
 from pachon.studies.sweep.sweep import run_sweep
+from pachon.studies.sweep.table import described_metric
+from pachon.studies.sweep.telescope_point import has_no_camera
 
 LENS = "tests/data/zmx/lens1.zmx"
 FIELDS = [[0.0, 0.0], [0.0, 8.0]]
@@ -60,6 +63,16 @@ def test_points_against_telescopes_made_by_hand(tmp_path):
     assert table.metrics["spot_rms_um"][1] > 1.1 * table.metrics["spot_rms_um"][0]
 
 
+def test_a_file_that_gets_a_camera_has_one(tmp_path):
+    """Within one process, as of a notebook."""
+    path = tmp_path / "mine.yaml"
+    sweep = read_sweep({**CONTENT, "base": {"telescope": str(path)}}, "test")
+    pachon.save_telescope(pachon.load_telescope(LENS), path)
+    assert has_no_camera(sweep, {}, tmp_path)
+    pachon.save_telescope(pachon.load_telescope("lsst_v3.3_r"), path)
+    assert not has_no_camera(sweep, {}, tmp_path)
+
+
 def test_compensators(tmp_path):
     plain = table_of(tmp_path / "a", metrics=["spots"])
     solved = table_of(tmp_path / "b", metrics=["spots"], compensators=["Image.dz_um", "Image.rx_arcmin"])
@@ -70,6 +83,50 @@ def test_compensators(tmp_path):
     moved = moved.perturbed("Image", shift=(0.0, 0.0, 1e-6 * height), tilt=(np.deg2rad(tilt / 60.0), 0.0, 0.0))
     radii = 1e6 * pachon.spots(moved, np.deg2rad(FIELDS), [486.1e-9, 656.3e-9], n_pupil=6).rms_radius
     assert solved.metrics["spot_rms_um"][1] == pytest.approx(np.sqrt(np.mean(radii**2)), rel=1e-9)
+
+
+#: Two paraboloids with one focus, a beam expander of 5: its light is parallel.
+EXPANDER = """
+name: expander
+source: none
+version: none
+units: {length: m, angle: deg, wavelength: um}
+stop: {z: 0.0}
+pupil: {diameter: 0.05, obscuration: 0.0}
+launch_distance: 2.0
+reference_sphere_radius: 1.0
+field: {radius: 0.1, limit: 0.5}
+wavelengths: {range: [0.4, 0.7], default: 0.5}
+design: {afocal: true}
+surfaces:
+  - {name: M1, type: mirror, shape: conic, z: 0.0, radius: 2.0, conic: -1.0}
+  - {name: M2, type: mirror, shape: conic, z: 0.8, radius: 0.4, conic: -1.0}
+  - {name: Exit, type: detector, shape: plane, z: -0.1}
+"""
+
+
+@pytest.mark.long
+def test_images_at_infinity_are_in_angles(tmp_path):
+    """Of the sweep and of a baseline: a spot of an afocal telescope has no micrometres."""
+    (tmp_path / "expander.yaml").write_text(EXPANDER)
+    telescope = pachon.load_telescope(tmp_path / "expander.yaml")
+    base, parameters = {"telescope": str(tmp_path / "expander.yaml")}, {"M2.dz_um": {"nominal": 0, "values": [0, 5]}}
+    metrics = ["spots", "ee80", "mtf", "wavefront"]
+    table = table_of(tmp_path, base=base, parameters=parameters, fields_deg=[[0, 0.05]], metrics=metrics)
+    assert {name: described_metric(name).unit for name in table.metrics} == {
+        **dict.fromkeys(("spot_rms_urad", "spot_worst_urad", "ee80_urad", "ee80_worst_urad"), "urad"),
+        **dict.fromkeys(("mtf50_per_mrad", "mtf50_worst_per_mrad"), "1/mrad"),
+        "wavefront_rms_nm": "nm",
+    }
+    assert described_metric("ee80_urad").text == described_metric("ee80_um").text
+    angles = pachon.spots(telescope.perturbed("M2", shift=(0, 0, 5e-6)), [[0, np.deg2rad(0.05)]], n_pupil=6)
+    assert table.metrics["spot_rms_urad"][1] == pytest.approx(1e6 * angles.rms_radius[0], rel=1e-9)
+    figures = make_baseline(str(tmp_path / "expander.yaml"), fields=np.deg2rad([[0.0, 0.05]]))[0].figures
+    units = {name.partition(" ")[0]: metric.unit for name, metric in figures.items()}
+    assert (units["landing"], units["spot"], units["ee80"], units["opd"]) == ("mrad", "urad", "urad", "nm")
+    assert figures["distortion focal length"].unit == ""
+    # A field of 0.05 degrees leaves five times as large.
+    assert figures["landing y field (0, 0.05) pupil (0, 0)"].value == pytest.approx(5 * np.deg2rad(50), rel=1e-4)
 
 
 @pytest.mark.slow

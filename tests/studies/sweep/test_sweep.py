@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from pachon.core.errors import ConfigError, PachonError
 from pachon.core.units import ARCSEC
 from pachon.models.io.bundled import DATA
 from pachon.models.io.prescription import load_telescope
+from pachon.pipeline.config import with_run
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.focal_plane_stage import apply_focal_plane_model
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
@@ -226,6 +228,26 @@ def test_every_metric_gives_finite_figures(folder):
     } <= names
 
 
+def test_bins_of_the_correlation_have_one_name_in_all_replicas():
+    """Stars of another seed have other mean separations: replicas would never meet in one column."""
+    base = {"ccds": ["R22_S11"], "psf": {"engine": "long_exposure"}, "stars": {"truth": 15}}
+    sweep = read_sweep(
+        {"base": base, "parameters": {"M2.dz_um": {"nominal": 0, "values": [0]}}, "metrics": ["xi_bins"]}, "test"
+    )
+    found = []
+    for seed in (1, 2):
+        experiment = point_experiment(sweep, SweepPoint(0, {"M2.dz_um": 0}, seed), Path())
+        scene = Scene(experiment.telescope, experiment, threads=1)
+        found.append(STARS["xi_bins"].compute(scene))
+        assert list(found[-1].values())[: scene.bins.n_bins] == pytest.approx(scene.correlation.xi_plus, nan_ok=True)
+    # Stars that reach farther have a bin more.
+    few, many = sorted(found, key=len)
+    assert set(few) <= set(many)
+    # Eight bins from 10 arcmin to 3 degrees, and as wide ones below.
+    middles = [float(name.split("_")[2]) for name in many if name.startswith("xi_plus")]
+    assert middles == pytest.approx(10.0 * 18.0 ** ((np.arange(len(middles)) - 7.5) / 8.0), rel=3e-3)
+
+
 def test_more_points_than_there_is_room_for_are_refused_before_starting(folder):
     content = {
         "parameters": {f"M1.Z{j}_nm": {"range": [0, 1]} for j in range(4, 16)},
@@ -277,6 +299,23 @@ def test_sweep_files_may_name_the_file_of_their_configuration(folder):
     (folder / "base.yaml").write_text("seed: 5\nccds: [R22_S11]\n")
     (folder / "two.yaml").write_text("base: base.yaml\nparameters: {band: {nominal: r, values: [r, i]}}\n")
     assert load_sweep(folder / "two.yaml").base == {"seed": 5, "ccds": ["R22_S11"]}
+
+
+def test_files_of_a_configuration_in_another_folder_lie_beside_it(folder):
+    """As for the run alone; a file of the same name beside the sweep is another one."""
+    runs = folder / "runs"
+    runs.mkdir()
+    for place in (runs / "mine.yaml", runs / "site.yaml", folder / "mine.yaml"):
+        place.write_text("content: of no matter here\n")
+    (runs / "run.yaml").write_text("telescope: mine.yaml\natmosphere: {site: site.yaml}\nccds: [R22_S11]\n")
+    (folder / "two.yaml").write_text("base: runs/run.yaml\nparameters: {band: {nominal: r, values: [r, i]}}\n")
+    base = load_sweep(folder / "two.yaml").base
+    assert (base["telescope"], base["atmosphere"]["site"]) == (str(runs / "mine.yaml"), str(runs / "site.yaml"))
+    # Of nights, visits and images too.
+    run = with_run({"run": "runs/run.yaml"}, folder / "night.yaml")["run"]
+    assert run == {**base, "ccds": ["R22_S11"]}
+    beside = with_run({"run": "run.yaml"}, runs / "night.yaml")["run"]
+    assert beside["telescope"] == "mine.yaml"
 
 
 @pytest.mark.slow

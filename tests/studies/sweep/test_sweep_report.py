@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from pachon.core.page import with_digits
+from pachon.models.parameters.changes import ANGLES, LENGTHS
 from pachon.studies.metrics.stars import STARS
 from pachon.studies.metrics.telescope import TELESCOPE_METRICS
 from pachon.studies.sweep.analysis import allowances, curves
@@ -51,6 +52,24 @@ def test_effects_budget_and_allowances_are_those_of_a_sum_of_squares(tmp_path):
     assert "they add, as far as this tells" in page
     sentence = '<p class="verdict">a matters most for xi_raw_short, which it changes by up to +1.6e-05; next is b'
     assert page.index(sentence) < page.index("<img") < page.index("<table")
+
+
+@pytest.mark.usefixtures("empty_pictures")
+@pytest.mark.parametrize(
+    ("excess", "words"), [(0.3, "they do not simply add"), (0.0, "they add, as far as this tells")]
+)
+def test_effects_that_do_not_add_in_any_replica_do_not_add(tmp_path, excess, words):
+    """All at once make three tenths more in each of four replicas, whose effects differ by far more than that."""
+    sweep = SWEEP.model_copy(update={"design": SWEEP.design.model_copy(update={"replicas": 4})})
+    points = numbered_points(sweep, Path())
+    create_store(tmp_path / "s.sweep", sweep, points, {})
+    seeds = sorted({p.seed for p in points})
+    with SweepStore(tmp_path / "s.sweep") as store:
+        for p in points:
+            a, b = (p.parameters[name] ** 2 for name in "ab")
+            xi = 1e-6 * (1 + seeds.index(p.seed)) * (a + 3.0 * b) * (1.0 + excess * (a > 0.0 and b > 0.0))
+            store.write(PointResult(p.number, {"xi_raw_short": xi}, None, 0.1, "here"))
+        assert words in write_report(store, tmp_path / "report").read_text()
 
 
 @pytest.mark.long
@@ -133,6 +152,9 @@ def test_every_metric_and_parameter_is_defined_in_the_report(tmp_path):
     assert described_parameter("focal_plane.raft_um") == ("um", "rafts, peak to valley, not the budget's [um]")
     assert described_parameter("R22_S11.rx_urad") == ("urad", "change of R22_S11: tilt about x")
     assert described_parameter("M1.Z5_nm") == ("nm", "change of Z5 of M1")
+    for unit in (*LENGTHS, *ANGLES):
+        assert described_parameter(f"L1.rx_{unit}") == (unit, "change of L1: tilt about x")
+        assert described_metric(f"solved L1.rx_{unit}").unit == unit
     content = {"parameters": {"M2.dz_um": {"nominal": 0, "range": [0, 4]}}, "design": {"points": 3}}
     sweep = read_sweep(content, "test")
     create_store(tmp_path / "s.sweep", sweep, points := numbered_points(sweep, Path()), {})
