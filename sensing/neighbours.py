@@ -164,13 +164,13 @@ class NeighbourSearch:
             values = np.linalg.lstsq(matrix, (stamp.image * weight).ravel(), rcond=None)[0]
             fluxes = values[: len(columns)]
             residual = stamp.image - (matrix @ values).reshape(stamp.image.shape)
-        kept = np.flatnonzero(fluxes > _LEAST_RATIO * fluxes.max(initial=0.0))
-        if len(kept) < 2:
+        bright = np.flatnonzero(fluxes > _LEAST_RATIO * fluxes.max(initial=0.0))
+        if len(bright) < 2:
             return None
-        star, main = self.first.copy(), kept[0]
+        star, main = self.first.copy(), bright[0]
         star[FLUX], star[[X, Y]] = max(fluxes[main], 1.0), places[main]
-        others = [(fluxes[k] / star[FLUX], *(places[k] - places[main])) for k in kept[1:]]
-        star = np.concatenate([star, *others])
+        companions = [(fluxes[k] / star[FLUX], *(places[k] - places[main])) for k in bright[1:]]
+        star = np.concatenate([star, *companions])
         return self.solve(stamp, star, nothing, COARSE, STEPS, hopeless)
 
     def _with_near_neighbour(self, best: Solution) -> Solution:
@@ -191,9 +191,9 @@ class NeighbourSearch:
             return best
         nothing, trials = np.zeros_like(best.shared), []
         # The template stands in the middle of the two.
-        middle, others = self.first, neighbours_of(best.stars[0])
-        ratios = others[:, :1] * best.stars[0][FLUX] / middle[FLUX]
-        places = others[:, 1:] + best.stars[0][[X, Y]] - middle[[X, Y]]
+        middle, companions = self.first, neighbours_of(best.stars[0])
+        ratios = companions[:, :1] * best.stars[0][FLUX] / middle[FLUX]
+        places = companions[:, 1:] + best.stars[0][[X, Y]] - middle[[X, Y]]
         middle = np.concatenate([middle, np.hstack([ratios, places]).ravel()])
         for radius in _NEAR_RADII:
             for angle in np.arange(_NEAR_ANGLES) * np.pi / _NEAR_ANGLES:
@@ -238,12 +238,12 @@ class NeighbourSearch:
 
 def _divided(star: np.ndarray, ratio: float, offset: np.ndarray) -> np.ndarray:
     """Return unknowns of two stars of a flux ratio, an offset apart, with the light of one; its neighbours stay."""
-    divided, others = star[:RATIO].copy(), neighbours_of(star).copy()
+    divided, companions = star[:RATIO].copy(), neighbours_of(star).copy()
     divided[FLUX] /= 1.0 + ratio
     divided[[X, Y]] -= (shift := ratio / (1.0 + ratio) * offset)
-    others[:, 0] *= 1.0 + ratio
-    others[:, 1:] += shift
-    return np.concatenate([divided, [ratio], offset, others.ravel()])
+    companions[:, 0] *= 1.0 + ratio
+    companions[:, 1:] += shift
+    return np.concatenate([divided, [ratio], offset, companions.ravel()])
 
 
 def _is_neighbour(trial: Solution, best: Solution) -> bool:
@@ -261,7 +261,7 @@ def _central_first(solution: Solution) -> Solution:
         return solution
     star[FLUX] *= ratio
     star[[X, Y]] += offset
-    others = np.delete(stars, central, axis=0)
-    others = np.column_stack([others[:, 0] / ratio, others[:, 1:] - offset])
-    star[RATIO:] = others[np.argsort(-others[:, 0], kind="stable")].ravel()
+    companions = np.delete(stars, central, axis=0)
+    companions = np.column_stack([companions[:, 0] / ratio, companions[:, 1:] - offset])
+    star[RATIO:] = companions[np.argsort(-companions[:, 0], kind="stable")].ravel()
     return replace(solution, stars=(star,))
