@@ -27,7 +27,7 @@ _NEAR = 1.0
 #: lacks much, its derivatives are not good enough for the last hundredth, and errors have what is left.
 _EXPLAINED = 1e-2
 #: Power of what a model lacks at the low frequencies of a wavefront, over its mean square: residuals are as wide as the
-#: seeing. Real donuts of DECam repeat alike for factors from 2 to 12.
+#: seeing. Real donuts of DECam repeat alike for 4 and for 12.
 _SMOOTH = 4.0
 #: Largest weight of priors: those of real donuts are some hundreds.
 _MOST_WEIGHT = 1e3
