@@ -19,7 +19,7 @@ from ..models.telescope import Telescope
 from ..raytrace.rays import RayStatus, parallel_rays
 from ..raytrace.trace import TraceResult, trace
 from ..wavefront.pupil_polynomials import PupilPolynomials
-from .pupil_cells import PupilCells, pupil_cells
+from .pupil_cells import FEWEST, PupilCells, near_smooth_map, pupil_cells
 from .rim_outlines import MOTIONS, RimMotion, Simple, is_vane, moved_aperture, outline, simple_regions, vane_width
 
 #: Standard deviation of the shift and of the growth of a rim over its own size, and most of it over the diameter of the
@@ -42,8 +42,6 @@ _SURVEY = 32
 _BETWEEN = 4.0
 #: Side of their lattice over that of the cells.
 _MARGIN = 1.04
-#: Least number of points that determine these places as smooth functions of the pupil.
-_FEWEST = 90
 #: Distance from a rim at which it is told whether light passes, in sides of a cell.
 _BESIDE = 0.02
 #: Steps by which places on the pupil are found.
@@ -292,8 +290,9 @@ class PupilShadows:
         None where too little of the light meets it.
         """
         places = self._places(surface, self._ends)
-        reached = np.isfinite(places).all(axis=1)
-        if reached.sum() < _FEWEST:
+        lit = self._ends[-1].status == RayStatus.OK
+        reached = near_smooth_map(self._survey, places, lit, self._middle, self._half)
+        if reached.sum() < FEWEST:
             return None
         key = reached.tobytes()
         if key not in self._polynomials:

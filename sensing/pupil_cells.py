@@ -40,6 +40,10 @@ _MOST_NODES = 33
 _PARTS = 4
 #: Points along each side of the lattice whose light says where vanes stand on the pupil.
 _SURVEY = 13
+#: Least number of points that determine places on a surface as smooth functions of the pupil.
+FEWEST = 90
+#: Distance from where a smooth map of the lit rays has it, over the width of their light, of a ray that is astray.
+_ASTRAY = 5e-3
 #: Points of the rim that the width of an aimed beam is taken from.
 _RIM = 48
 
@@ -211,16 +215,36 @@ def _crossed(
     crossed, narrowest = np.zeros(len(places), dtype=bool), math.inf
     for surface, regions in vanes.items():
         landing = telescope.surfaces[surface].to_local(ends[surface].position)[:, :2]
-        met = np.isfinite(landing).all(axis=1)
+        middle = 0.5 * (places[0] + places[-1])
+        met = near_smooth_map(survey, landing, ends[-1].status == RayStatus.OK, middle, side)
         if not met.any():
             continue
-        smooth = PupilPolynomials(survey[met], 0.5 * (places[0] + places[-1]), side)
+        smooth = PupilPolynomials(survey[met], middle, side)
         x, y = smooth.at(places, landing[met])[0].T
         largest = float(np.linalg.svd(smooth.derivatives(landing[met]), compute_uv=False).max())
         for region in regions:
             crossed |= widened(region, math.sqrt(2.0) * side * largest).contains(x, y)
             narrowest = min(narrowest, vane_width(region) / largest)
     return crossed.reshape(centers.shape[:-1]), narrowest
+
+
+def near_smooth_map(
+    points: np.ndarray, places: np.ndarray, lit: np.ndarray, center: np.ndarray, least: float
+) -> np.ndarray:
+    """Return which rays meet a surface where a smooth map of the lit ones has them, or nearly, [n].
+
+    Rays that were stopped may pass later lenses far outside of what is ground. Arguments: points of the pupil [n, 2],
+    places on the surface [n, 2], NaN where they miss it, which rays are lit, and `center` and `least` of
+    :class:`~pachon.wavefront.pupil_polynomials.PupilPolynomials`. All that meet it where few are lit.
+    """
+    met = np.isfinite(places).all(axis=1)
+    lit = lit & met
+    if (met.all() and lit.all()) or lit.sum() < FEWEST:
+        return met
+    smooth = PupilPolynomials(points[lit], center, least)
+    expected = smooth.at(points[met], places[lit])[0]
+    met[met] = np.hypot(*(places[met] - expected).T) < _ASTRAY * float(np.ptp(places[lit], axis=0).max())
+    return met
 
 
 def _beam(telescope: Telescope, direction: np.ndarray, wavelength: float) -> tuple[np.ndarray, float]:
