@@ -195,12 +195,7 @@ def fit_donuts(
         return _solved(instrument, observed, list(pool.map(prepared, range(len(observed)))), fit, pool)
 
     def first(i: int) -> StarFit:
-        if i in vote.fitted:
-            return vote.fitted[i]
-        if i not in vote.begun:
-            return alone(instrument, i)
-        begun = vote.begun[i].with_light(instrument)
-        return alone(instrument, i, replace(begun, searched=not vote.diffraction))
+        return vote.fit_of(i, instrument, alone)
 
     def once_more(refined: Instrument, fitted: _Fitted) -> _Fitted:
         return fitted_stars(refined, lambda i: alone(refined, i, replace(fitted.stars[i], searched=True)))

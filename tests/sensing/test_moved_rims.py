@@ -264,24 +264,18 @@ def test_rims_of_hsc_are_where_its_light_is():
 
 
 @pytest.mark.long
-def test_a_donut_of_hsc_that_loses_a_tenth_of_its_light():
-    """Its rims were missed, and the wavefront was 764 nm off."""
-    hsc, fields = (
-        pachon.load_telescope("hsc").perturbed("Detector", shift=(0.0, 0.0, 0.8e-3)),
-        np.deg2rad([[0.0, 0.68]]),
-    )
+def test_donuts_of_hsc_whose_rays_are_no_start():
+    """The fit with diffraction began from one of rays, 290 nm off, and ended 670 nm off with a loss 1.2 times as large."""
+    hsc = pachon.load_telescope("hsc").perturbed("Detector", shift=(0.0, 0.0, 0.8e-3))
+    fields = np.deg2rad([[-0.10693917, 0.67602943]])
     aberration = pachon.wavefront.ResidualWavefront.draw(hsc, 200e-9, 2, 0)
-    drawn = pachon.draw_donuts(
-        hsc,
-        fields,
-        [770e-9],
-        atmosphere=pachon.Atmosphere.from_site("cerro_pachon", seed=2, r0=0.2),
-        electrons=3e6,
-        sky=300.0,
-        read_noise=5.0,
-        seed=2,
-        aberration=aberration,
-        stamps=pachon.Stamps(91, pixel_size=15e-6),
-    )
-    fit = pachon.fit_donuts(hsc, drawn.images, fields, 770e-9, pixel_size=15e-6, sky_variance=drawn.sky_variance)
-    assert np.linalg.norm(fit.zernikes - aberration.at(np.tan(fields))) < 150e-9
+    air = pachon.Atmosphere.from_site("cerro_pachon", seed=2, r0=0.2)
+    light = {"electrons": 3e6, "sky": 300.0, "read_noise": 5.0, "stamps": pachon.Stamps(91, pixel_size=15e-6)}
+    for seed in (1, 3):
+        drawn = pachon.draw_donuts(
+            hsc, fields, [770e-9], atmosphere=air, seed=seed, aberration=aberration, threads=1, **light
+        )
+        fit = pachon.fit_donuts(
+            hsc, drawn.images, fields, 770e-9, pixel_size=15e-6, sky_variance=drawn.sky_variance, threads=1
+        )
+        assert np.linalg.norm(fit.zernikes - aberration.at(np.tan(fields))) < 100e-9
