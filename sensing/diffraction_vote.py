@@ -39,10 +39,6 @@ _BEFOREHAND = 2.0 * math.log(10.0)
 #: Part of the strength of the turbulence that stands for diffracted light, from which on derivatives at the seeing of a
 #: fit by rays say nothing of one by waves: LSST, DECam and HSC have 0.1 to 0.23, 1.2 m at f/2.5 0.34 to 0.42.
 _MUCH = 0.3
-#: Loss a pixel beyond noise of a fit with diffraction that began from one by rays, and the most of it over that of
-#: these, with which the search is done again: where waves explain much, rays are no start, and it may end elsewhere.
-_MUCH_LEFT = 0.12
-_MISLED = 0.7
 
 
 @dataclass(frozen=True)
@@ -131,19 +127,8 @@ def _chi2_fall(rays: StarFit, waves: StarFit) -> float:
     return float((before - after)[stamp.used[middle] & by_waves.full.used[middle_of_waves]].sum())
 
 
-def _misfit(fit: StarFit) -> float:
-    """Return the loss a pixel; infinite without a model."""
-    return math.inf if fit.usable is None else fit.usable.solution.loss / fit.usable.stamp.used.sum()
-
-
-def _misled(rays: StarFit, waves: StarFit) -> bool:
-    """Return whether a fit with diffraction may have begun at the wrong place: it leaves much, and rays far more."""
-    left = _misfit(waves) - 1.0
-    return bool(left > _MUCH_LEFT and left < _MISLED * (_misfit(rays) - 1.0))
-
-
 class DiffractionVote(NamedTuple):
-    """Whether light is diffracted, by the first stars: fits of these by rays, and those with diffraction if any."""
+    """Whether light is diffracted, by the first stars: fits of these by rays where others may begin, or with waves."""
 
     diffraction: bool
     by_rays: Mapping[int, StarFit] = MappingProxyType({})
@@ -151,17 +136,15 @@ class DiffractionVote(NamedTuple):
 
     def fit_of(self, star: int, instrument: Instrument, alone: Callable[..., StarFit]) -> StarFit:
         """Return the fit of a star by itself, where there is one by rays begun from that; arguments as of the vote."""
+        if star in self.by_waves:
+            return self.by_waves[star]
         if star not in self.by_rays:
             return alone(instrument, star)
         rays = self.by_rays[star]
-        if not self.diffraction:
-            begun = replace(rays.with_light(instrument), searched=True)
-            return alone(instrument, star, begun) if rays.preliminary else rays
-        waves = self.by_waves.get(star) or alone(instrument, star, rays.with_light(instrument))
-        if not _misled(rays, waves):
-            return waves
-        searched = alone(instrument, star)
-        return searched if _misfit(searched) < _misfit(waves) else waves
+        if not (self.diffraction or rays.preliminary):
+            return rays
+        begun = replace(rays.with_light(instrument), searched=not self.diffraction)
+        return alone(instrument, star, begun)
 
 
 def vote_on_diffraction(
@@ -196,7 +179,7 @@ def vote_on_diffraction(
         by_waves: dict[int, StarFit] = {}
         for i, star in by_rays.items():
             if len(by_waves) < _VOTERS and abs(fall) < CONTRADICTED and (star.usable is None or _has_air(star.usable)):
-                by_waves[i] = alone(waves, i, star.with_light(waves))
+                by_waves[i] = alone(waves, i)
                 fall += _chi2_fall(star, by_waves[i])
-        return DiffractionVote(fall > 0.0, by_rays, by_waves)
+        return DiffractionVote(True, by_waves=by_waves) if fall > 0.0 else DiffractionVote(False, by_rays)
     return DiffractionVote(diffraction, by_rays)

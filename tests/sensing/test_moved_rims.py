@@ -265,7 +265,7 @@ def test_rims_of_hsc_are_where_its_light_is():
 
 @pytest.mark.long
 def test_donuts_of_hsc_whose_rays_are_no_start():
-    """The fit with diffraction began from one of rays, 290 nm off, and ended 670 nm off with a loss 1.2 times as large."""
+    """Fits with diffraction began from those of rays, 290 nm off, and ended 750 nm off with 1.2 times the loss."""
     hsc = pachon.load_telescope("hsc").perturbed("Detector", shift=(0.0, 0.0, 0.8e-3))
     fields = np.deg2rad([[-0.10693917, 0.67602943]])
     aberration = pachon.wavefront.ResidualWavefront.draw(hsc, 200e-9, 2, 0)
