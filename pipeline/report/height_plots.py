@@ -53,7 +53,7 @@ def vendor_heights_plot(focal_plane: FocalPlane, title: str) -> Figure:
             label = f"{name.upper()}: median {np.median(widths[of]):.1f} µm"
             lower.hist(widths[of], width_bins, histtype="step", color=colour, lw=1.4, label=label)
         upper.set(xlabel="height [µm]", ylabel="density [1/µm]", xlim=(-edge, edge))
-        lower.set(xlabel="width of the middle 95 % of the heights of a CCD [µm]", ylabel="CCDs")
+        lower.set(xlabel="middle 95 % of the heights of a CCD [µm]", ylabel="CCDs")
         lower.set_xlim(0.0, max(1.05 * float(np.nanmax(widths)), 1.0))
         for panel in (upper, lower):
             panel.margins(y=0.25)
