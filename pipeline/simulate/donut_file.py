@@ -40,6 +40,7 @@ _NOLL = np.arange(4, 23)
 _WITHIN = 0.95
 #: Points of the pupil's rim whose light bounds a donut, and room beside it, in FWHM of the seeing.
 _RIM_POINTS = 16
+_RINGS = (0.6, 0.7, 0.8, 0.9, 1.0)
 _WINGS = 1.5
 
 
@@ -180,9 +181,12 @@ def _stamp_size(telescope: Telescope, fields: np.ndarray, model: DonutModel) -> 
     """Return a side of stamps that holds donuts at fields, and the wings of their seeing [pixels]."""
     angle = 2.0 * np.pi * np.arange(_RIM_POINTS) / _RIM_POINTS
     rim = 0.5 * telescope.pupil_diameter * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    optics = trace_pupils(telescope, fields, telescope.default_wavelength, rim)
+    rings = np.multiply.outer(_RINGS, rim).reshape(-1, 2)
+    optics = trace_pupils(telescope, fields, telescope.default_wavelength, rings)
     seeing = float(np.max(radians(model.air.fwhm, "fwhm"))) * float(np.abs(optics.jacobian).max())
-    reach = float(np.nanmax(np.abs(optics.displacement), initial=0.0)) + _WINGS * seeing
+    # Rays that apertures stop may land far off.
+    landed = np.abs(optics.displacement).max(axis=-1, where=optics.lit[..., None], initial=0.0)
+    reach = float(landed.max(initial=0.0)) + _WINGS * seeing
     return max(STAMP_SIZE, 2 * int(np.ceil(reach / model.detector.pixel())) + 1)
 
 
