@@ -291,9 +291,9 @@ def _with_priors(
     loss += float(precision @ deviation**2)
     if group.strength_prior is not None:
         for at in bounds[:-1] + STRENGTH:
-            precision = group.strength_prior.precision(joined[at])
-            curvature[at, at] += precision
-            gradient[at] -= precision * group.strength_prior.deviation(joined[at])
+            of_strength = group.strength_prior.precision(joined[at])
+            curvature[at, at] += of_strength
+            gradient[at] -= of_strength * group.strength_prior.deviation(joined[at])
             loss += group.strength_prior.loss(joined[at])
     if not (np.isfinite(loss) and np.isfinite(curvature).all() and np.isfinite(gradient).all()):
         # No step starts there, and none leads there.
