@@ -177,7 +177,7 @@ class NeighbourSearch:
         """Return the best solution with a neighbour that overlaps most of the star, if that explains much more.
 
         A fit of one star takes two for one that is larger and oddly shaped. If a score test says that there may be two,
-        the second is tried where that puts it, then around the first, both without aberrations.
+        the second is tried where that puts it, and else around the first, both stars without aberrations.
         """
         if len(neighbours_of(best.stars[0])) == MOST_NEIGHBOURS:
             return best

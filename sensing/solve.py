@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -89,7 +90,7 @@ class Group:
             return 1.0
         return min(1.0 + _SMOOTH * max(loss / self.pixels - 1.0, 0.0), _MOST_WEIGHT)
 
-    @property
+    @cached_property
     def pixels(self) -> int:
         """Number of pixels in use."""
         return sum(int(stamp.used.sum()) for stamp in self.stamps)
