@@ -34,7 +34,7 @@ from .plots import density_picture, null_test_picture
 from .psf_errors import PsfAtGalaxies, PsfErrorResponse
 from .psf_visit import StackFrame, stack_limit
 from .stack import PsfStack
-from .visits import cell_of, pixel_scale_of, stack_path
+from .visits import cell_of, stack_path
 
 #: S/N of a star as faint as the faintest galaxies that are drawn: fainter ones have no useful ellipticity.
 FAINTEST_SNR = 8.0
@@ -90,7 +90,7 @@ def null_test(
     with error_context(file=folder / CONFIG_NAME):
         experiment = config.experiment()
     frame = StackFrame.of(experiment, STACK_STAMP)
-    cell, scale = cell_of(experiment, frame), pixel_scale_of(frame)
+    cell, scale = cell_of(experiment, frame), frame.pixel_scale
     seed = experiment.config.seed
     reach = REACH * float(cell / np.sqrt(config.visits.places))
     source = config.galaxy_source(experiment, Exposure.of_run(experiment, gain=1.0, pixel_scale=scale))

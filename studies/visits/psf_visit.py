@@ -36,6 +36,7 @@ from ..night.detector_row import noise_columns
 from .plan import Visit
 from .resample import resample_stamps
 from .sky_points import SkyPoints
+from .visit_figures import VisitFigures
 
 # FWHM of the magnitude limits of the stars, which are the same in every visit, good or bad.
 _NOMINAL_FWHM = 0.7 * ARCSEC
@@ -67,6 +68,11 @@ class StackFrame:
         u, scale, vt = np.linalg.svd(center)
         return cls(u @ vt * scale.mean() / experiment.pixel_size, size)
 
+    @property
+    def pixel_scale(self) -> float:
+        """Angle of a pixel of the stack [rad]."""
+        return float(1.0 / np.sqrt(abs(np.linalg.det(self.matrix))))
+
     def to_stamp(self, experiment: Experiment, visit: Visit, sky: np.ndarray, threads: int | None = None) -> np.ndarray:
         """Return d(x, y of a stamp of the visit)/d(x, y of the stack) at positions of the sky, shape [n, 2, 2]."""
         on_detector = visit.jacobians(experiment.telescope, sky, middle_wavelength(experiment), threads)
@@ -81,6 +87,7 @@ class VisitPsfs:
     true: np.ndarray  #: noise-free PSFs, [n, size, size]
     model: np.ndarray  #: those of the model, likewise
     left_out: dict[str, str]  #: CCDs that could not be modelled, and the reasons
+    figures: VisitFigures  #: of these PSFs
     weight: float | None = None  #: in stacks, an inverse variance; None where all visits have the same
 
 
@@ -219,7 +226,10 @@ def visit_psfs(
         stamps = resample_stamps(np.concatenate(images), matrix, frame.size, threads=threads)
         return np.asarray(stamps / stamps.sum(axis=(1, 2), keepdims=True, dtype=np.float64).astype(np.float32))
 
-    return VisitPsfs(rows, turned(true), turned(model), simulated.not_modelled, stack_weight(experiment, visit))
+    true_psfs, modelled_psfs = turned(true), turned(model)
+    figures = VisitFigures.of(true_psfs, modelled_psfs, points.star[rows], frame.pixel_scale, experiment.weight_fwhm)
+    weight = stack_weight(experiment, visit)
+    return VisitPsfs(rows, true_psfs, modelled_psfs, simulated.not_modelled, figures, weight)
 
 
 def stack_weight(experiment: Experiment, visit: Visit) -> float | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,6 +23,7 @@ from ...measure.focal_plane_axes import draw_compass, draw_whisker_panels
 from ...measure.shapes import Shapes, measure_shapes
 from ...sky.sky_shapes import along_sky
 from .psf_visit import VisitPsfs
+from .visit_figures import FIGURES, VisitFigures
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,6 +45,8 @@ class PsfSums:
         Visits that cover each point.
     true, model : ndarray of float32, shape [n, size, size]
         Sums of PSFs of unit sum, times the weights of their visits.
+    figures : list of VisitFigures
+        Those of each visit.
     weight : ndarray, shape [n], optional
         Sums of the weights at each point; None where all visits have the weight 1.
     """
@@ -52,6 +55,7 @@ class PsfSums:
     count: np.ndarray
     true: np.ndarray
     model: np.ndarray
+    figures: list[VisitFigures] = field(default_factory=list)
     weight: np.ndarray | None = None
 
     @classmethod
@@ -70,12 +74,18 @@ class PsfSums:
             self.model[psfs.index] += np.float32(psfs.weight) * psfs.model
             self.weight[psfs.index] += psfs.weight
         self.count[psfs.index] += 1
+        self.figures.append(psfs.figures)
         self.visits += 1
 
     def write(self, path: Path, stamp: Stamp) -> None:
         """Write the sums, exactly as they are."""
         hdus = [fits.ImageHDU(self.count, name="COUNT"), image_hdu("TRUE", self.true, "sums of the true PSFs")]
         hdus.append(image_hdu("MODEL", self.model, "sums of the PSFs of the models"))
+        columns = {
+            name: (np.array([getattr(one, name) for one in self.figures]), unit, description)
+            for name, (unit, description) in FIGURES.items()
+        }
+        hdus.append(table_hdu("VISITS", columns))
         if self.weight is not None:
             hdus.append(fits.ImageHDU(self.weight, name="WEIGHT"))
         write_fits(path, hdus, stamp, [(VISITS_CARD, self.visits, "in the sums")])
@@ -87,7 +97,9 @@ class PsfSums:
         count = np.array(hdus["COUNT"].data, dtype=np.int32)
         images = _image_from_hdu(hdus["TRUE"]), _image_from_hdu(hdus["MODEL"])
         weight = np.array(hdus["WEIGHT"].data, dtype=np.float64) if "WEIGHT" in hdus else None
-        return cls(hdus[0].header[VISITS_CARD], count, *images, weight)
+        columns = [column(hdus["VISITS"], name) for name in FIGURES]
+        figures = [VisitFigures(*map(float, row)) for row in zip(*columns, strict=True)]
+        return cls(hdus[0].header[VISITS_CARD], count, *images, figures, weight)
 
 
 @dataclass(frozen=True, eq=False)

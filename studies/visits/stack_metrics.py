@@ -10,6 +10,7 @@ from ...core.units import ARCMIN, ARCSEC
 from ...measure.correlation import SEPARATION_RANGES, Correlation, patches_of_jackknife, shear_correlation
 from ...pipeline.summary import bins_up_to
 from .stack import PsfStack
+from .visit_figures import rms_modulus
 
 #: Correlations of a stack: of the true PSFs at all points, and of true minus model at stars and where no star is. With
 #: ``_g``, they are of g of the adaptive moments, else of the weighted e.
@@ -71,17 +72,17 @@ def stack_metrics(stack: PsfStack, correlated: StackCorrelations) -> dict[str, f
     size = (stack.size - stack.model_size) / stack.size
     metrics: dict[str, float] = {
         "points": len(stack),
-        "rms_e": _rms_modulus(*e),
-        "rms_residual_e_stars": _rms_modulus(*(v[stars] for v in residual_e)),
-        "rms_residual_e_places": _rms_modulus(*(v[places] for v in residual_e)),
+        "rms_e": rms_modulus(*e),
+        "rms_residual_e_stars": rms_modulus(*(v[stars] for v in residual_e)),
+        "rms_residual_e_places": rms_modulus(*(v[places] for v in residual_e)),
         # Medians beside the rms: a polynomial fitted to few stars goes far astray at a few places.
         "median_residual_e_stars": _median_modulus(*(v[stars] for v in residual_e)),
         "median_residual_e_places": _median_modulus(*(v[places] for v in residual_e)),
         "median_size_arcsec": float(np.nanmedian(stack.size) / ARCSEC),
         "rms_relative_residual_size_places": float(np.sqrt(np.nanmean(size[places] ** 2))),
-        "rms_g": _rms_modulus(stack.g1, stack.g2),
-        "rms_residual_g_stars": _rms_modulus(*(v[stars] for v in residual_g)),
-        "rms_residual_g_places": _rms_modulus(*(v[places] for v in residual_g)),
+        "rms_g": rms_modulus(stack.g1, stack.g2),
+        "rms_residual_g_stars": rms_modulus(*(v[stars] for v in residual_g)),
+        "rms_residual_g_places": rms_modulus(*(v[places] for v in residual_g)),
         "median_residual_g_stars": _median_modulus(*(v[stars] for v in residual_g)),
         "median_residual_g_places": _median_modulus(*(v[places] for v in residual_g)),
         "rms_dt_g_places": float(np.sqrt(np.nanmean(stack.relative_size_residual[places] ** 2))),
@@ -96,8 +97,3 @@ def stack_metrics(stack: PsfStack, correlated: StackCorrelations) -> dict[str, f
 def _median_modulus(e1: np.ndarray, e2: np.ndarray) -> float:
     """Return the median of the absolute value of an ellipticity."""
     return float(np.nanmedian(np.hypot(e1, e2)))
-
-
-def _rms_modulus(e1: np.ndarray, e2: np.ndarray) -> float:
-    """Return the rms of the absolute value of an ellipticity."""
-    return float(np.sqrt(np.nanmean(e1**2 + e2**2)))

@@ -37,6 +37,7 @@ from .psf_visit import (
 from .sky_points import SkyPoints, draw_points
 from .stack import PsfStack, PsfSums
 from .stack_metrics import StackCorrelations, stack_correlations, stack_metrics
+from .visit_figures import FIGURES, VisitFigures
 
 #: Sums of the visits so far, from which the stack goes on.
 SUMS_NAME = "sums.fits"
@@ -52,8 +53,10 @@ class StackResult:
         Its products.
     stacks : dict of int to PsfStack
         Stacks by number of visits.
-    correlations : dict of int to Correlated
+    correlations : dict of int to StackCorrelations
         Their correlations.
+    figures : tuple of VisitFigures
+        Ellipticities and sizes of each visit.
     summary : dict
         Content of ``summary.json``.
     """
@@ -61,6 +64,7 @@ class StackResult:
     folder: Path
     stacks: dict[int, PsfStack]
     correlations: dict[int, StackCorrelations]
+    figures: tuple[VisitFigures, ...]
     summary: dict[str, Any]
 
 
@@ -126,7 +130,6 @@ def stack_visits(
         raise ProductError(f"{folder} kept no stack of {stacked}, and has gone on; choose another --out")
     if sums.visits:
         reporter.line(f"{sums.visits} of {counted(len(visits), 'visit is', 'visits are')} stacked already")
-    scale = pixel_scale_of(frame)
     due = visits[sums.visits :]
     # In this process each visit shows its own stages.
     alone = execution.alone
@@ -142,15 +145,17 @@ def stack_visits(
                 reporter.line(f"{visit.label}: {_left_out_line(psfs.left_out)}")
             sums.add(psfs)
             if sums.visits in config.kept:
-                stack = PsfStack.of(sums, points.sky, points.star, frame.matrix, scale, experiment.weight_fwhm)
+                stack = PsfStack.of(
+                    sums, points.sky, points.star, frame.matrix, frame.pixel_scale, experiment.weight_fwhm
+                )
                 stack.write_product(stack_path(folder, sums.visits), stamp)
             # Written last, so that all visits that it counts are in the stack.
             sums.write(folder / SUMS_NAME, stamp)
     stacks = {n: PsfStack.read(stack_path(folder, n), stamp) for n in config.kept}
     with reporter.stage("correlations"):
         correlated = {n: stack_correlations(stack, cell_of(experiment, frame)) for n, stack in stacks.items()}
-    summary = _write_products(folder, config, experiment, stamp, visits, stacks, correlated)
-    return StackResult(folder, stacks, correlated, summary)
+    summary = _write_products(folder, config, experiment, stamp, visits, sums.figures, stacks, correlated)
+    return StackResult(folder, stacks, correlated, tuple(sums.figures), summary)
 
 
 def compute_visit(
@@ -171,14 +176,9 @@ def _left_out_line(reasons: dict[str, str]) -> str:
     return f"{len(reasons)} CCDs are left out, they cannot be modelled; CCD {name}: {reason}"
 
 
-def pixel_scale_of(frame: StackFrame) -> float:
-    """Return the angle of a pixel of the stack [rad]."""
-    return float(1.0 / np.sqrt(abs(np.linalg.det(frame.matrix))))
-
-
 def cell_of(experiment: Experiment, frame: StackFrame) -> float:
     """Return the angle that the shortest side of a CCD has in the middle of the field [rad]."""
-    return float(experiment.camera.shortest_side / experiment.pixel_size * pixel_scale_of(frame))
+    return float(experiment.camera.shortest_side / experiment.pixel_size * frame.pixel_scale)
 
 
 def sky_points_of(experiment: Experiment, config: VisitsConfig, frame: StackFrame) -> SkyPoints:
@@ -186,7 +186,7 @@ def sky_points_of(experiment: Experiment, config: VisitsConfig, frame: StackFram
     camera, names = experiment.camera, experiment.config.ccds or ()
     corners = camera.corners(camera.ccd_index(name) for name in names)
     reach = min(float(np.hypot(*corners.T).max()), experiment.field_radius_on_detector)
-    radius = reach / experiment.pixel_size * pixel_scale_of(frame) + np.deg2rad(config.visits.dither_deg)
+    radius = reach / experiment.pixel_size * frame.pixel_scale + np.deg2rad(config.visits.dither_deg)
     settings = config.visits
     return draw_points(experiment.config.seed, radius, cell_of(experiment, frame), settings.stars, settings.places)
 
@@ -230,6 +230,7 @@ def _write_products(
     experiment: Experiment,
     stamp: Stamp,
     visits: tuple[Visit, ...],
+    figures: list[VisitFigures],
     stacks: dict[int, PsfStack],
     found: dict[int, StackCorrelations],
 ) -> dict[str, Any]:
@@ -249,6 +250,8 @@ def _write_products(
         weights = [stack_weight(visit_experiment(experiment, v), v) for v in visits]
         columns["visitId"] = (np.array([visit.visit for visit in listed]), "", "number of the visit in the list")
         columns["weight"] = (np.array(weights), "nJy-2", "of its PSFs in the stack, by an inverse variance")
+    for name, (unit, description) in FIGURES.items():
+        columns[name] = (np.array([getattr(one, name) for one in figures]), unit, description)
     write_ecsv(folder / "visits.ecsv", columns, {"what": "visits in the order of the stack", **stamp.meta()})
     summary = {
         **stamp.meta(),

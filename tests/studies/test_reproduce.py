@@ -85,7 +85,12 @@ def test_figures_of_visits_are_those_of_their_folder(few_galaxies, tmp_path):
     bench = Bench(TINY, tmp_path, execution=Execution(threads=2))
     summary = reproduce(["fig10", "fig15", "fig16", "fig17", "fig18"], bench)["figures"]
     stacks = json.loads((tmp_path / "visits" / "summary.json").read_text())["stacks"]
-    assert summary["fig15"]["measured"]["rms_e_2"] == pytest.approx(stacks["2"]["rms_e"], rel=1e-8)
+    measured = summary["fig15"]["measured"]
+    assert measured["rms_e_2"] == pytest.approx(stacks["2"]["rms_e"], rel=1e-8)
+    # One visit is the mean of all, of which the first is one.
+    single = Table.read(tmp_path / "visits" / "visits.ecsv")["rms_e"]
+    assert single[0] == pytest.approx(measured["rms_e_1"], rel=1e-5)
+    assert measured["rms_e_single"] == pytest.approx(np.sqrt(np.mean(single**2)))
     galaxies = json.loads((tmp_path / "visits" / "null_test.json").read_text())["stacks"]
     assert summary["fig17"]["measured"]["usable_per_arcmin2_1"] == pytest.approx(galaxies["1"]["usable_per_arcmin2"])
     assert ", without an error, beyond 10' in 2 visits" in summary["fig17"]["here"]

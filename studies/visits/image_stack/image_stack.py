@@ -20,7 +20,7 @@ from ....pipeline.run_folder import CONFIG_NAME
 from ..config import STACK_STAMP, VisitsConfig, load_visits_configuration
 from ..plan import Visit
 from ..psf_visit import StackFrame, middle_wavelength, stack_limit, visit_telescope
-from ..visits import pixel_scale_of, sky_points_of
+from ..visits import sky_points_of
 from .config import ImageStackConfig, load_image_stack_configuration
 from .tiles import Tile, choose_tiles
 from .visit_image import Sky
@@ -171,7 +171,7 @@ def _resolved_settings(
 
 def _exposure(experiment: Experiment, frame: StackFrame, visits: int = 1, *, noise: bool = True) -> Exposure:
     # Stacks are in electrons.
-    return Exposure.of_run(experiment, visits, gain=1.0, pixel_scale=pixel_scale_of(frame), noise=noise)
+    return Exposure.of_run(experiment, visits, gain=1.0, pixel_scale=frame.pixel_scale, noise=noise)
 
 
 def _settings_before(folder: Path) -> ImageStackConfig | None:

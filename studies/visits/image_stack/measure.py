@@ -33,7 +33,7 @@ from ..null_result import NullTest, null_metrics
 from ..null_test import FAINTEST_SNR, REACH, write_pictures, write_shapes
 from ..psf_visit import stack_limit
 from ..stack import PsfStack
-from ..visits import cell_of, pixel_scale_of, stack_path
+from ..visits import cell_of, stack_path
 from .image_stack import ImageStack
 from .picture import stacks_png
 from .stack_images import galaxies_on
@@ -184,7 +184,7 @@ def measure_tile(
     objects = detect_objects(image.image, variance, image.mask, threshold=_THRESHOLD, background_size=None)
     truth = image.objects
     key: tuple[str | int, ...] = ("images", psfs.visits, natural_number(tile.column), natural_number(tile.row))
-    scale = pixel_scale_of(stack.frame)
+    scale = stack.frame.pixel_scale
     reach = REACH * cell_of(stack.experiment, stack.frame) / float(np.sqrt(stack.visits.visits.places))
     places = np.flatnonzero(~psfs.star)
     at = np.stack([objects.x, objects.y], axis=1) + tile.first
@@ -287,7 +287,7 @@ def _star_metrics(
     stars: StarSelection, psfs: PsfStack, transfer: np.ndarray, stack: ImageStack, tile: Tile
 ) -> dict[str, float]:
     """Return how the selected stars differ from the true PSFs of the stack at them."""
-    scale = pixel_scale_of(stack.frame)
+    scale = stack.frame.pixel_scale
     star_rows = np.flatnonzero(psfs.star)
     places = np.stack([psfs.x, psfs.y], axis=1)[star_rows] / scale - tile.first
     match = match_positions(stars.positions[:, 0], stars.positions[:, 1], places[:, 0], places[:, 1], MATCH_RADIUS)

@@ -15,6 +15,7 @@ from pachon.studies.night.config import ListSection
 from pachon.studies.visits.plan import listed_plan
 from pachon.studies.visits.psf_visit import VisitPsfs
 from pachon.studies.visits.stack import PsfSums
+from pachon.studies.visits.visit_figures import VisitFigures
 from pachon.studies.visits.visits import SUMS_NAME, stack_visits
 
 
@@ -40,9 +41,9 @@ def test_directions_are_those_of_the_pointings(list_file):
 def test_sums_have_weights():
     rng = np.random.default_rng(3)
     images, weights = rng.random((3, 2, 5, 5)), [0.5, 2.0, 1.0]
-    sums = PsfSums.empty(2, 5)
+    sums, figures = PsfSums.empty(2, 5), VisitFigures(0.01, 0.001, 0.002, 0.3)
     for image, weight in zip(images.astype(np.float32), weights, strict=True):
-        sums.add(VisitPsfs(np.arange(2), image, image, {}, weight))
+        sums.add(VisitPsfs(np.arange(2), image, image, {}, figures, weight))
     mean = np.average(images, axis=0, weights=weights)
     np.testing.assert_allclose(sums.true / sums.weight[:, None, None], mean, rtol=1e-6)
 

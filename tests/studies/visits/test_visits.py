@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import Table
 
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, PachonError
@@ -69,6 +70,23 @@ def test_models_follow_the_psf(stacked):
         assert abs(np.nanmean(stack.residual_e1)) < 2e-3
     assert set(result.stacks) == {1, 2}
     assert result.stacks[2].count.max() == 2
+
+
+def test_each_visit_has_the_figures_of_its_psfs(stacked, visits_config):
+    result, folder = stacked
+    visits = Table.read(folder / "visits.ecsv")
+    assert len(visits) == len(result.figures) == 2
+    # The stack of one visit is that visit.
+    with fits.open(folder / "stack_0001.fits") as hdus:
+        star = hdus["POINTS"].data["STAR"]
+        scale = StackFrame.of(visits_config().experiment(), 31).pixel_scale
+        true, model = (measure_shapes(hdus[name].data, scale, 0.7 * ARCSEC) for name in ("TRUE", "MODEL"))
+    residual = np.hypot(true.e1 - model.e1, true.e2 - model.e2)
+    assert visits["rms_e"][0] == pytest.approx(np.sqrt(np.mean(true.e1**2 + true.e2**2)), rel=1e-5)
+    for rows, name in ((star, "stars"), (~star, "places")):
+        assert visits[f"rms_residual_e_{name}"][0] == pytest.approx(np.sqrt(np.mean(residual[rows] ** 2)), rel=1e-3)
+    assert visits["median_size"].unit == "arcsec"
+    assert visits["median_size"][0] == pytest.approx(np.median(true.size) / ARCSEC, rel=1e-5)
 
 
 def test_a_stack_has_adaptive_moments_of_its_images(stacked):
