@@ -16,7 +16,7 @@ from ...models.ideal_telescope import ideal_telescope
 from ...models.star_spectrum import blackbody_photons
 from ...wavefront.chief_rays import fields_of_groups
 from ...wavefront.psf.engine import center_focal_length
-from ...wavefront.psf.engines import ENGINES, psf_engine
+from ...wavefront.psf.engines import psf_engine
 from ...wavefront.psf.light import Light
 from ...wavefront.psf.psf import make_psfs
 from ...wavefront.psf.stamps import Stamps
@@ -46,6 +46,7 @@ class NoiseFreeStars:
     fields: np.ndarray  #: field angles [rad], [n, 2]
     lit_fraction: np.ndarray  #: light that arrives over that on the axis, mean over wavelengths, [n]
     offset: np.ndarray  #: place of the reference point from the centre of the middle pixel [pixel], [n, 2]
+    first: np.ndarray | None = None  #: images as the engine drew them before they were centred, likewise
 
     def part(self, index: slice) -> NoiseFreeStars:
         """Return some of the stars."""
@@ -55,6 +56,7 @@ class NoiseFreeStars:
             fields=self.fields[index],
             lit_fraction=self.lit_fraction[index],
             offset=self.offset[index],
+            first=None,
         )
 
 
@@ -184,15 +186,6 @@ def _expose_twice(
     temperatures: np.ndarray | None,
 ) -> tuple[NoiseFreeStars, NoiseFreeStars]:
     """Make the PSFs of observed stars, with the room of their stamps, and the same on the centre of a pixel."""
-    positions = np.concatenate(groups)
-    first: list[np.ndarray] = []
-
-    def kept_centroid(images: np.ndarray, pixel_scale: float) -> np.ndarray:
-        # The engine measures each star where it was drawn first.
-        light = images.sum(axis=(1, 2))
-        first.append((images / np.where(light > 0.0, light, 1.0)[:, None, None]).astype(np.float32))
-        return _centroids(experiment, images, pixel_scale)
-
     moved = _expose(
         experiment,
         groups,
@@ -201,17 +194,17 @@ def _expose_twice(
         room=_SHIFT_ROOM,
         cut_off=True,
         offsets=offsets,
-        recenter=kept_centroid,
+        recenter=partial(_centroids, experiment),
         temperatures=temperatures,
     )
-    drawn_first = np.concatenate(first)
-    drawn_first[ENGINES[experiment.config.psf.engine].order(moved.fields)] = drawn_first.copy()
-    images = _with_static_displacements(experiment, positions - offsets * experiment.pixel_size, drawn_first)
+    assert moved.first is not None
+    middles = np.concatenate(groups) - offsets * experiment.pixel_size
+    images = _with_static_displacements(experiment, middles, moved.first)
     rim = _SHIFT_ROOM // 2
     inner = moved.image[:, rim:-rim, rim:-rim]
     light = inner.sum(axis=(1, 2), keepdims=True, dtype=np.float64)
     centered = (inner / np.where(light > 0.0, light, 1.0)).astype(np.float32)
-    return replace(moved, image=images, offset=offsets), replace(moved, image=centered)
+    return replace(moved, image=images, offset=offsets, first=None), replace(moved, image=centered, first=None)
 
 
 def expose_centered(
@@ -226,7 +219,8 @@ def expose_centered(
     # The engine draws them at the position that compensates their shift by the atmosphere. Resampling, as of observed
     # stars, would leave ringing along rows and columns where an image is not quite band-limited.
     recenter = partial(_centroids, experiment)
-    return _expose(experiment, [positions], threads, progress, recenter=recenter, along=along)
+    stars = _expose(experiment, [positions], threads, progress, recenter=recenter, along=along)
+    return replace(stars, first=None)
 
 
 def _centroids(experiment: Experiment, images: np.ndarray, pixel_scale: float) -> np.ndarray:
@@ -307,7 +301,8 @@ def _expose(
     if transposed:
         image, offset = np.ascontiguousarray(image.swapaxes(1, 2)), offset[:, ::-1]
     on_axis = experiment.lit_fraction_on_axis if optical else 1.0
-    return NoiseFreeStars(image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1) / on_axis, offset)
+    lit_fraction = psfs.lit_fraction.mean(axis=1) / on_axis
+    return NoiseFreeStars(image, float(psfs.pixel_scale), fields, lit_fraction, offset, psfs.first)
 
 
 def _with_static_displacements(experiment: Experiment, middles: np.ndarray, images: np.ndarray) -> np.ndarray:

@@ -58,6 +58,7 @@ class RenderedStars:
     lit_fraction: np.ndarray  #: of the pupil, [n_star, n_wave]
     reference_point: np.ndarray  #: point of the CCD at the star's place on the stamp, telescope frame, [n_star, 3] m
     offset: np.ndarray  #: place (x, y) of that point from the centre of the middle pixel, [n_star, 2] pixels
+    first: np.ndarray | None = None  #: images before they were drawn once more
 
 
 class ExposedStars(NamedTuple):
@@ -126,11 +127,6 @@ class PsfEngine(ABC):
     def _renderer(self, inputs: PsfInputs) -> PsfRenderer:
         """Return the renderer of the stars of one call."""
 
-    @staticmethod
-    def order(fields: np.ndarray) -> np.ndarray:
-        """Return indices of stars at field angles [n_star, 2] [rad] in the order in which they are rendered."""
-        return np.arange(len(fields))
-
     def with_n_pupil(self, n_pupil: int | None) -> Self:
         """Return the engine with another number of pupil points; the same one if it has no such option."""
         options: dict[str, Any] = {"n_pupil": n_pupil}
@@ -171,8 +167,8 @@ class PsfRenderer(ABC):
         return [order[first : first + self.batch] for first in range(0, len(order), self.batch)]
 
     def _order(self, fields: np.ndarray) -> np.ndarray:
-        """Return indices of stars in the order in which they are rendered, [n_star], that of the engine."""
-        return PsfEngine.order(fields)
+        """Return indices of stars at field angles [n_star, 2] [rad] in the order in which they are rendered."""
+        return np.arange(len(fields))
 
     def render(
         self,
@@ -188,12 +184,12 @@ class PsfRenderer(ABC):
         n_wave] are the relative numbers of photons of each wavelength, of mean 1; by default all are 1.
         """
         stars = self._expose(Stars(fields, offsets, photons))
-        image = stars.draw(None)
-        if recenter is not None:
-            shift = recenter(image)
-            offsets = offsets - shift
-            image = stars.draw(shift)
-        return RenderedStars(image, stars.lit_fraction, stars.reference_point, offsets)
+        first = stars.draw(None)
+        if recenter is None:
+            return RenderedStars(first, stars.lit_fraction, stars.reference_point, offsets)
+        shift = recenter(first)
+        image = stars.draw(shift)
+        return RenderedStars(image, stars.lit_fraction, stars.reference_point, offsets - shift, first)
 
     def _trace(
         self, fields: np.ndarray, pupil: np.ndarray, threads: int | None, wavelengths: np.ndarray | None = None

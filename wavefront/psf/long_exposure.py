@@ -127,11 +127,6 @@ class LongExposureEngine(PsfEngine):
     def _renderer(self, inputs: PsfInputs) -> LongExposureRenderer:
         return LongExposureRenderer(inputs, self)
 
-    @staticmethod
-    def order(fields: np.ndarray) -> np.ndarray:
-        """Return indices of stars from the centre outwards, so that those that lose much light share a few batches."""
-        return np.argsort(np.hypot(*fields.T), kind="stable")
-
 
 class LongExposureRenderer(PsfRenderer):
     """Renderer of :class:`LongExposureEngine`."""
@@ -257,7 +252,8 @@ class LongExposureRenderer(PsfRenderer):
         self._fade_y = spread.astype(np.float32)
 
     def _order(self, fields: np.ndarray) -> np.ndarray:
-        return LongExposureEngine.order(fields)
+        # From the centre outwards, so that stars that lose much light share a few batches.
+        return np.argsort(np.hypot(*fields.T), kind="stable")
 
     def _expose(self, stars: Stars) -> ExposedStars:
         if self._general:

@@ -58,6 +58,8 @@ class Psfs(Result):
         Fraction of the light that falls on the stamp and, in silicon, turns into charge.
     flags : ndarray of int, shape [n_star]
         0, or :data:`DARK`.
+    first : ndarray of float32, shape [n_star, ny, nx], optional
+        With a ``recenter`` of the stamps, images before they were drawn once more, of unit sum.
     """
 
     _table = ("fields", "reference_point", "offset", "lit_fraction", "inside", "flags")
@@ -72,6 +74,7 @@ class Psfs(Result):
     lit_fraction: np.ndarray
     inside: np.ndarray
     flags: np.ndarray
+    first: np.ndarray | None = None
 
     def _label(self) -> str:
         waves = [f"{1e9 * w:.6g}" for w in self.wavelengths[:3]] + ["..."] * (len(self.wavelengths) > 3)
@@ -226,13 +229,16 @@ def _render_stars(
     centroids: Recenter | None = None if recenter is None else lambda images: recenter(images, pixel_scale)
     image = np.empty((n_star, size, size), dtype=np.float32)
     lit_fraction = np.empty((n_star, len(inputs.wavelengths)))
+    first = None if recenter is None else np.empty_like(image)
     reference_point, offset, inside = np.empty((n_star, 3)), np.empty((n_star, 2)), np.empty(n_star)
     renderer.prepare(stars.fields)
     for batch in renderer.batches(stars.fields):
         batch_stars = stars[batch]
         rendered = renderer.render(batch_stars.fields, batch_stars.offsets, centroids, batch_stars.photons)
-        inside[batch] = rendered.image.sum(axis=(1, 2))
-        image[batch] = rendered.image / np.where(inside[batch] > 0.0, inside[batch], 1.0)[:, None, None]
+        image[batch], inside[batch] = _of_unit_sum(rendered.image)
+        if first is not None:
+            assert rendered.first is not None
+            first[batch], _ = _of_unit_sum(rendered.first)
         lit_fraction[batch], reference_point[batch] = rendered.lit_fraction, rendered.reference_point
         offset[batch] = rendered.offset
         if progress is not None:
@@ -247,7 +253,14 @@ def _render_stars(
         lit_fraction=lit_fraction,
         inside=inside,
         flags=np.where(lit_fraction.any(axis=1), 0, DARK),
+        first=first,
     )
+
+
+def _of_unit_sum(images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return images over their sums, those of no light as they are, and the sums."""
+    light = images.sum(axis=(1, 2))
+    return images / np.where(light > 0.0, light, 1.0)[:, None, None], light
 
 
 def _relative_photons(values: Any, n_star: int, n_wave: int) -> np.ndarray:

@@ -154,7 +154,8 @@ def test_engines_agree_through_the_same_screens(lsst_r):
 )
 def test_recentred_stars_are_those_drawn_at_the_other_place(lsst_r, engine):
     """Told where a star is seen, an engine draws it where it then is seen at the centre of a pixel."""
-    fields = np.radians([[0.3, -0.2], [1.1, 0.9]])
+    # Not in the order in which engines render them.
+    fields = np.radians([[1.1, 0.9], [0.3, -0.2]])
     offsets = np.array([[0.4, -0.3], [0.1, 0.2]])
     # Without screens exposures are long.
     long_air = Atmosphere.from_site("cerro_pachon", 4, exposure=15.0)
@@ -172,6 +173,10 @@ def test_recentred_stars_are_those_drawn_at_the_other_place(lsst_r, engine):
     # The centroid of a fifth of a second in pixels of 0.2 arcsec depends a little on where in a pixel it lies.
     assert np.abs(centroids(psfs.image, psfs.pixel_scale)).max() < 5e-3
     assert np.abs(psfs.offset - offsets).max() > 0.05
+    # Where they were drawn first.
+    first = make_psfs(lsst_r, fields, WAVELENGTHS, stamps=Stamps(21, offsets=offsets), **options)
+    assert psfs.first.tobytes() == first.image.tobytes()
+    assert first.first is None
     np.testing.assert_array_equal(again.offset, psfs.offset)
 
 
