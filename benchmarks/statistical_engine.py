@@ -245,7 +245,7 @@ def matched(images, options, telescope, fields):
         return np.array([s.e1[0], s.e2[0], np.log(s.size[0])])
 
     misfits = []
-    for exposure in images[:: max(1, len(images) // 8)]:
+    for exposure in images[:: max(1, len(images) // 64)]:
         for star in range(len(spectra)):
             moments, goal = np.zeros(3), shape(exposure[star], 0.7)
             for _ in range(4):
