@@ -19,7 +19,7 @@ from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import DomainError
 from ...core.memory import require_bytes
 from ...core.threads import one_blas_thread
-from ...core.units import field_label, length, require_count, require_within
+from ...core.units import length, require_count, require_within
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling, SamplingName, pupil_sampling
@@ -27,7 +27,15 @@ from ...wavefront.request import Request, relative_weights
 from ..metrics.principal_rays import principal_rays_of
 from ..metrics.spots import SpotReference, spot_diagram
 from .diffraction_psf import DiffractionMethod, DiffractionPsf, pixel_axis
-from .wavelets import WaveletLattice, Wavelets, lattice_wavelets, range_of_cosines, spot_reach, traced_wavelets
+from .wavelets import (
+    WaveletLattice,
+    Wavelets,
+    lattice_wavelets,
+    range_of_cosines,
+    require_light,
+    spot_reach,
+    traced_wavelets,
+)
 
 #: What replaces arguments that a request has.
 _REQUEST = "telescope=Request.of(telescope, fields, wavelengths, {}=...)"
@@ -201,9 +209,7 @@ class _Plan:
         # The middle of the images weighs all wavelengths alike.
         alike, pupil = relative_weights(None, len(request.wavelengths)), pupil_sampling(request.telescope)
         self.spots = spot_diagram(replace(request, weights=alike, pupil=pupil), reference)
-        if not (self.spots.lit_fraction > 0).all():
-            dark = request.fields[self.spots.lit_fraction <= 0][0]
-            raise DomainError(f"{field_label(dark)}: no light passes; expected a lit pupil")
+        require_light(self.spots)
         #: Range of direction cosines across the pupil: the largest of all fields and directions.
         self.range_of_cosines = range_of_cosines(principal_rays_of(request))
         self.wave_over_range = float(request.wavelengths.min()) / self.range_of_cosines

@@ -233,5 +233,6 @@ def test_other_errors(lsst_r, paraboloid):
         huygens_psf(lsst_r, reference="middle")
     telescope = paraboloid()
     dark = replace(telescope.surfaces[0], aperture=Circle(0.001, x=1.0))
-    with pytest.raises(DomainError, match="no light passes"):
-        fft_psf(replace(telescope, surfaces=(dark, telescope.surfaces[1])), [[0.0, 0.0]])
+    for image in (fft_psf, huygens_psf, pachon.mtf):
+        with pytest.raises(DomainError, match="no light passes"):
+            image(replace(telescope, surfaces=(dark, telescope.surfaces[1])), [[0.0, 0.0]])
