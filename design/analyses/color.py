@@ -214,12 +214,14 @@ def chromatic_focus(
     radii = np.atleast_1d(pure_numbers(zones, "zones"))
     if radii.ndim != 1 or not ((radii > 0) & (radii <= 1)).all():
         raise DomainError(f"zones = {zones!r}: expected a list of numbers above 0 and up to 1")
+    focal_plane = None
     if isinstance(telescope, Request):
         stated = Request.of(telescope, None, wavelengths, threads=threads)
         telescope, wavelengths, threads = stated.telescope, stated.wavelengths, stated.threads
+        focal_plane = stated.focal_plane
     if wavelengths is None:
         wavelengths = np.linspace(*(telescope.band or telescope.wavelength_range), _WAVELENGTHS)
-    request = Request.of(telescope, (0.0, 0.0), wavelengths, sampling=CHIEF_RAY, threads=threads)
+    request = Request.of(telescope, (0.0, 0.0), wavelengths, sampling=CHIEF_RAY, threads=threads).on(focal_plane)
     traced = np.concatenate([[_PARAXIAL], radii]) * 0.5 * telescope.pupil_diameter
     up = np.stack([np.zeros_like(traced), traced], axis=-1)
     pairs = np.concatenate([up, -up])
