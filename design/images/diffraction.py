@@ -152,6 +152,7 @@ def huygens_psf(
     """
     request = Request.of(telescope, fields, wavelengths, threads=threads)
     plan = _Plan(request, pixel, pixels, reference)
+    plan.require_memory()
     if n_pupil is None and sampling == "square":
         n_pupil = max(_HUYGENS_ACROSS, plan.points_for(max(plan.side, plan.spread)))
         plan.require_few(n_pupil, _HUYGENS_MOST, "fft_psf")
@@ -247,6 +248,11 @@ class _Plan:
                 key="n_pupil",
             )
 
+    def require_memory(self) -> None:
+        """Raise a DomainError where the samples of an image are too many."""
+        across = self.pixels * self._samples_across()
+        require_bytes(_BYTES_OF_SAMPLE * across**2, f"pixel = {self.pixel:g} m: {across} samples across the image")
+
     @one_blas_thread()
     def image(
         self,
@@ -256,8 +262,7 @@ class _Plan:
         progress: Callable[[int], None] | None,
     ) -> DiffractionPsf:
         """Return the images of all field points from a function that returns wavelets and their sum."""
-        across = self.pixels * self._samples_across()
-        require_bytes(_BYTES_OF_SAMPLE * across**2, f"pixel = {self.pixel:g} m: {across} samples across the image")
+        self.require_memory()
         finer = self._samples()
         images, lit, strehl = [], [], []
         for i, center in enumerate(self.spots.reference_point):
