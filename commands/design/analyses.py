@@ -162,7 +162,7 @@ def seidel(shared: SharedOptions) -> Outcome:
         raise ConfigError("--field-deg: expected one field")
     angle = None
     if shared.fields is not None:
-        x, y, z = field_direction(*shared.fields[0], shared.projection)
+        x, y, z = field_direction(shared.fields[0, 0], shared.fields[0, 1], shared.projection)
         angle = float(np.arctan2(np.hypot(x, y), -z))
     return Outcome(seidel_diagram(shared.telescope, shared.wavelength, field=angle), _seidel_rows)
 

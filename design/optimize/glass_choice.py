@@ -160,15 +160,15 @@ def choose_glasses(
     for name in names:
         free = _with_medium(free, name, _medium_of(free, name), name + _MODEL)
 
-    bounds = options.pop("bounds", None) or {}
+    bounds = options.get("bounds") or {}
 
     def optimum(start: Telescope, model_names: list[str], moved: Mapping[str, float]) -> Optimum:
         of_glasses = [f"{name}{_MODEL}.{quantity}" for name in model_names for quantity in ("n", "abbe")]
         # Limits of a motion are those of its change from the telescope as it was.
         shifts = {address: moved[address] for address in bounds if address in moved}
         remaining = {a: (min(bounds[a][0] - m, 0.0), max(bounds[a][1] - m, 0.0)) for a, m in shifts.items()}
-        addresses = [*fixed, *of_glasses]
-        return optimize(replace(state, telescope=start), addresses, merit, bounds={**bounds, **remaining}, **options)
+        moved_options: GlassOptions = {**options, "bounds": {**bounds, **remaining}}
+        return optimize(replace(state, telescope=start), [*fixed, *of_glasses], merit, **moved_options)
 
     model = best = optimum(free, names, {})
     count, trials, glass_by_medium = len(best.changes) - 2 * len(names), [], {}
