@@ -156,10 +156,14 @@ def seidel(shared: SharedOptions) -> Outcome:
     import numpy as np
 
     from ...design.analyses.seidel import seidel_diagram
+    from ...raytrace.rays import field_direction
 
     if shared.fields is not None and len(shared.fields) != 1:
         raise ConfigError("--field-deg: expected one field")
-    angle = None if shared.fields is None else float(np.linalg.norm(shared.fields[0]))
+    angle = None
+    if shared.fields is not None:
+        x, y, z = field_direction(shared.fields[0, 0], shared.fields[0, 1], shared.projection)
+        angle = float(np.arctan2(np.hypot(x, y), -z))
     return Outcome(seidel_diagram(shared.telescope, shared.wavelength, field=angle), _seidel_rows)
 
 

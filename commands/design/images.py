@@ -187,7 +187,7 @@ def ghosts(
     coatings: Annotated[
         Path | None, Option(metavar="FILE", help="Coatings of lens surfaces, a file as of throughput.")
     ] = None,
-    rays: Annotated[int, Option(min=400, max=10_000_000, help="Rays of the star.")] = 40000,
+    rays: Annotated[int, Option(min=400, max=400_000, help="Rays of the star.")] = 40000,
     brightest: Annotated[
         int | None,
         Option(

@@ -18,7 +18,7 @@ from ...raytrace.rays import Projection
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
-from ..metrics.principal_rays import principal_rays_of, tangential_axes
+from ..metrics.principal_rays import image_axes, principal_rays_of
 from .analysis import Analysis, Columns, band_wavelengths, line_request, require_focus
 from .field_curvature import close_foci
 
@@ -180,7 +180,7 @@ def lateral_color(
     point = np.zeros((1, 2))
     landing = np.stack([request.bundles(float(w), point).chief_landing() for w in request.wavelengths], axis=1)
     principal = principal_rays_of(request)
-    along = np.einsum("fwi,fi->fw", landing, tangential_axes(request)[:, 0])
+    along = np.einsum("fwi,fi->fw", landing, image_axes(request)[:, 0])
     shift = along - along[:, request.wavelengths == request.middle][:, :1]
     ratio = principal.mean_f_number
     return LateralColor(request, shift, 1.22 * request.middle * np.where(np.isinf(ratio), np.nan, ratio))
@@ -214,12 +214,14 @@ def chromatic_focus(
     radii = np.atleast_1d(pure_numbers(zones, "zones"))
     if radii.ndim != 1 or not ((radii > 0) & (radii <= 1)).all():
         raise DomainError(f"zones = {zones!r}: expected a list of numbers above 0 and up to 1")
+    focal_plane = None
     if isinstance(telescope, Request):
         stated = Request.of(telescope, None, wavelengths, threads=threads)
         telescope, wavelengths, threads = stated.telescope, stated.wavelengths, stated.threads
+        focal_plane = stated.focal_plane
     if wavelengths is None:
         wavelengths = np.linspace(*(telescope.band or telescope.wavelength_range), _WAVELENGTHS)
-    request = Request.of(telescope, (0.0, 0.0), wavelengths, sampling=CHIEF_RAY, threads=threads)
+    request = Request.of(telescope, (0.0, 0.0), wavelengths, sampling=CHIEF_RAY, threads=threads).on(focal_plane)
     traced = np.concatenate([[_PARAXIAL], radii]) * 0.5 * telescope.pupil_diameter
     up = np.stack([np.zeros_like(traced), traced], axis=-1)
     pairs = np.concatenate([up, -up])

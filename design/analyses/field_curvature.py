@@ -9,7 +9,7 @@ Coddington's equations give (Kingslake & Johnson, Lens Design Fundamentals, 2nd 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from ...raytrace.rays import Projection, RayStatus
 from ...wavefront.bundles import Bundles
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
+from ..metrics.distortion import axis_scale
 from ..metrics.principal_rays import tangential_axes
 from .analysis import Analysis, Columns, line_request, require_focus
 
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
 #: Distance of the close rays from the centre of the pupil, in units of its radius: what spherical aberration does to
 #: the focus goes with the square of it, a millionth of that at the rim.
 _CLOSE = 1e-3
-#: Slopes of the chief rays that the scale on the axis is measured with.
-_NEAR_AXIS = 1e-4
 
 
 @dataclass(frozen=True)
@@ -47,10 +46,10 @@ class FieldCurvature(Analysis):
         Place of the focus [m] along the axis of the detector, positive behind the detector as light travels; of the
         rays close to the chief ray, in and across the plane of field point and axis.
     distortion : ndarray, shape [n_field, n_wave]
-        Landing point of the chief ray from the axis against the scale on the axis times the tangent of the field angle,
-        less 1 [percent]; 0 on the axis. Each wavelength has a scale of its own.
+        Landing point of the chief ray from the axis against the scale on the axis, along the field, times the tangent
+        of the field angle, less 1 [percent]; 0 on the axis. Each wavelength has a scale of its own.
     focal_length : ndarray, shape [n_wave]
-        That scale [m]: length on the detector over slope.
+        That scale [m]: length on the detector over slope; geometric mean where it differs along x and y.
     """
 
     tangential: np.ndarray
@@ -136,22 +135,18 @@ def field_curvature(
     telescope = request.telescope
     axes = tangential_axes(request)
     steps = _CLOSE * 0.5 * telescope.pupil_diameter * np.concatenate([axes, -axes], axis=1)
-    slopes = _NEAR_AXIS * np.array([0.0, 1.0, -1.0, 2.0, -2.0])
-    axis = replace(request.at_fields(np.stack([0.0 * slopes, slopes], axis=-1)), projection="gnomonic")
     foci, distortion, scales = [], [], []
     for wavelength in map(float, request.wavelengths):
         bundles = request.bundles(wavelength, steps)
         foci.append(close_foci(request, bundles))
-        origin, *ends = axis.bundles(wavelength, np.zeros((1, 2))).chief_landing()
-        near, far = (float(np.linalg.norm(ends[2 * i] - ends[2 * i + 1])) / (i + 1) for i in (0, 1))
-        # Distortion of third order adds to the scale with the square of the slope, which two slopes remove.
-        scale = (4.0 * near - far) / (6.0 * _NEAR_AXIS)
+        origin, jacobian = axis_scale(request, wavelength)
         slope = np.linalg.norm(request.slopes, axis=-1)
         height = np.linalg.norm(bundles.chief_landing() - origin, axis=-1)
         with np.errstate(invalid="ignore", divide="ignore"):
+            undistorted = np.linalg.norm(request.slopes @ jacobian.T, axis=-1)
             # On the axis it is zero, the limit.
-            distortion.append(np.where(slope > 1e-12, 100.0 * (height / (scale * slope) - 1.0), 0.0))
-        scales.append(scale)
+            distortion.append(np.where(slope > 1e-12, 100.0 * (height / undistorted - 1.0), 0.0))
+        scales.append(float(np.sqrt(np.abs(np.linalg.det(jacobian)))))
     require_focus(telescope, np.array(foci))
     tangential, sagittal = np.moveaxis(np.array(foci), 0, -1).transpose(1, 0, 2)
     return FieldCurvature(request, tangential, sagittal, np.stack(distortion, axis=-1), np.array(scales))

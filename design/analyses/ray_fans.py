@@ -20,7 +20,7 @@ from ...wavefront.bundles import Bundles
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
-from ..metrics.principal_rays import tangential_axes
+from ..metrics.principal_rays import image_axes, tangential_axes
 from .analysis import Analysis, Columns
 
 if TYPE_CHECKING:
@@ -89,8 +89,8 @@ class RayFans(Fans):
     Attributes
     ----------
     displacement : ndarray, shape [n_field, n_wave, 2, n, 2]
-        Landing points relative to the chief ray of the middle wavelength [m]; the last axis is along the field and
-        across it, in x and y of the detector. NaN where a ray does not arrive.
+        Landing points relative to the chief ray of the middle wavelength [m]; the last axis is along the image
+        of the field and across it, on the detector. NaN where a ray does not arrive.
     """
 
     displacement: np.ndarray
@@ -209,8 +209,8 @@ def ray_fans(
     DomainError
         If there are too few rays.
     """
-    request, pupil, axes, bundles = _traced(telescope, fields, wavelengths, n_points, projection, threads)
-    n = len(request.fields)
+    request, pupil, bundles = _traced(telescope, fields, wavelengths, n_points, projection, threads)
+    n, axes = len(request.fields), image_axes(request)
     chief = bundles[request.middle_index].chief_landing()
     landing = np.stack([b.landing() - chief[:, None] for b in bundles], axis=1).reshape(n, len(bundles), 2, -1, 2)
     return RayFans(request, pupil, _lit(bundles), np.einsum("fwkpi,fji->fwkpj", landing, axes))
@@ -245,7 +245,7 @@ def opd_fans(
     DomainError
         If there are too few rays, or the radius is zero or not finite.
     """
-    request, pupil, _, bundles = _traced(telescope, fields, wavelengths, n_points, projection, threads)
+    request, pupil, bundles = _traced(telescope, fields, wavelengths, n_points, projection, threads)
     telescope = request.telescope
     radius = telescope.sphere_radius
     if sphere_radius is not None:
@@ -266,15 +266,15 @@ def _traced(
     n_points: int,
     projection: Projection | None,
     threads: int | None,
-) -> tuple[Request, np.ndarray, np.ndarray, list[Bundles]]:
-    """Return request, pupil coordinates [n], axes of the fans and bundles of both fans, tangential first."""
+) -> tuple[Request, np.ndarray, list[Bundles]]:
+    """Return request, pupil coordinates [n] and bundles of both fans, tangential first."""
     count = require_count(n_points, "n_points", 3, 100_000)
     request = Request.of(telescope, fields, wavelengths, sampling=CHIEF_RAY, projection=projection, threads=threads)
     telescope = request.telescope
     pupil, axes = np.linspace(-1.0, 1.0, count), tangential_axes(request)
     points = 0.5 * telescope.pupil_diameter * pupil[:, None] * axes[:, :, None]
     points = points.reshape(len(axes), -1, 2)
-    return request, pupil, axes, [request.bundles(float(w), points) for w in request.wavelengths]
+    return request, pupil, [request.bundles(float(w), points) for w in request.wavelengths]
 
 
 def _lit(bundles: list[Bundles]) -> np.ndarray:

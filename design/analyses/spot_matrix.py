@@ -29,6 +29,11 @@ if TYPE_CHECKING:
 _HEIGHTS = 5
 #: Most heights of the detector.
 _MOST_HEIGHTS = 1000
+#: Default rings of rays.
+_RINGS = 10
+#: Most rays along the radius or the side of the pupil, and on a spiral.
+_MOST_ALONG = 1000
+_MOST_ON_SPIRAL = 10**6
 #: Largest of these heights, in depths of focus.
 _DEPTHS = 2.0
 
@@ -132,7 +137,7 @@ def spot_matrix(
     against: Literal["focus", "wavelength"] = "focus",
     defocus: ArrayLike | None = None,
     sampling: SamplingName | PupilSampling = "rings",
-    n_pupil: int | None = 10,
+    n_pupil: int | None = None,
     projection: Projection | None = None,
     threads: int | None = None,
 ) -> SpotMatrix:
@@ -141,7 +146,7 @@ def spot_matrix(
     Parameters
     ----------
     telescope, fields, sampling, n_pupil, projection, threads
-        As in :meth:`pachon.Request.of`.
+        As in :meth:`pachon.Request.of`, but for 10 rings by default.
     wavelengths : array_like or Quantity, shape [n_wave], optional
         Vacuum wavelengths [m]. Against the wavelength five across the band by default, where the file has no list.
     against : {"focus", "wavelength"}
@@ -162,7 +167,9 @@ def spot_matrix(
         if defocus is not None:
             raise DomainError("defocus: expected none with against = 'wavelength'")
         wavelengths = band_wavelengths(telescope, wavelengths)
-    rays = None if n_pupil is None else require_count(n_pupil, "n_pupil", 1, 1000)
+    rays = _RINGS if n_pupil is None and sampling == "rings" else n_pupil
+    if rays is not None:
+        rays = require_count(rays, "n_pupil", 1, _MOST_ON_SPIRAL if sampling == "spiral" else _MOST_ALONG)
     request = Request.of(
         telescope, fields, wavelengths, sampling=sampling, n_pupil=rays, projection=projection, threads=threads
     )

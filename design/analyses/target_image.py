@@ -17,7 +17,7 @@ from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import DomainError
 from ...core.plotting import figure_of
 from ...core.units import angle as one_angle
-from ...core.units import arcseconds, length, pure_numbers, require_count, require_positive
+from ...core.units import arcseconds, field_label, length, pure_numbers, require_count, require_positive
 from ...models.telescope import Telescope
 from ...raytrace.launch import launch_bundles
 from ...raytrace.rays import Projection, RayStatus, field_direction
@@ -204,6 +204,8 @@ def target_image(
     request.require_one_field()
     telescope = request.telescope
     principal = principal_rays_of(request)
+    if np.isnan(principal.mean_f_number).any():
+        raise DomainError(f"{field_label(request.fields[0])}: no light passes; expected a lit pupil")
     require_focus(telescope, principal.mean_f_number, principal.mean_plate_scale)
     scale = float(principal.mean_plate_scale[0])
     airy = 1.22 * request.middle * float(principal.mean_f_number[0]) * scale
@@ -242,7 +244,7 @@ def _landings(request: Request, picture: np.ndarray, step: float) -> Iterator[tu
         telescope.check_field(angles[..., 0], angles[..., 1])
         directions = field_direction(angles[..., 0].ravel(), angles[..., 1].ravel(), request.projection)
         pupil = np.tile(points, (len(angles), 1))[:, None]
-        light = np.repeat(picture[row[batch], column[batch]] / count, count)
+        light = np.repeat(request.pupil_areas[0] * picture[row[batch], column[batch]] / count, count)
         for wavelength, weight in zip(request.wavelengths, request.weights, strict=True):
             rays = launch_bundles(telescope, directions, float(wavelength), pupil)
             end = trace(telescope, rays, threads=request.threads)

@@ -19,7 +19,7 @@ from ...core.arguments import check_arguments, removed_arguments
 from ...core.errors import DomainError
 from ...core.memory import require_bytes
 from ...core.threads import one_blas_thread
-from ...core.units import field_label, length, require_count, require_within
+from ...core.units import length, require_count, require_within
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling, SamplingName, pupil_sampling
@@ -27,7 +27,15 @@ from ...wavefront.request import Request, relative_weights
 from ..metrics.principal_rays import principal_rays_of
 from ..metrics.spots import SpotReference, spot_diagram
 from .diffraction_psf import DiffractionMethod, DiffractionPsf, pixel_axis
-from .wavelets import WaveletLattice, Wavelets, lattice_wavelets, range_of_cosines, spot_reach, traced_wavelets
+from .wavelets import (
+    WaveletLattice,
+    Wavelets,
+    lattice_wavelets,
+    range_of_cosines,
+    require_light,
+    spot_reach,
+    traced_wavelets,
+)
 
 #: What replaces arguments that a request has.
 _REQUEST = "telescope=Request.of(telescope, fields, wavelengths, {}=...)"
@@ -45,8 +53,9 @@ _FEWEST = 256
 _MOST = 2048
 #: Period of the pattern in sides of the image.
 _PERIODS = 2.0
-#: Rays across the pupil for sums of Huygens' wavelets.
+#: Smallest and largest default number of rays across the pupil for sums of Huygens' wavelets.
 _HUYGENS_ACROSS = 160
+_HUYGENS_MOST = 512
 #: Wavelets summed at once: two complex numbers for each and each column of the image.
 _AT_ONCE = 4096
 #: Steps of the search for the peak across wavelength times focal ratio.
@@ -103,30 +112,15 @@ def fft_psf(
         If a number is out of range, no light passes, or the lattice is too coarse for the spots or the image.
     """
     request = Request.of(telescope, fields, wavelengths, threads=threads).on(focal_plane)
-    telescope = request.telescope
     plan = _Plan(request, pixel, pixels, reference)
-    side, unit = plan.pixel * plan.pixels, "urad" if telescope.design_data.afocal else "um"
     across = n_pupil
     if across is None:
         # The period of the pattern is this number times wavelength / (range of cosines).
-        needed = int(np.ceil(max(_PERIODS * side, side + plan.spread) / plan.wave_over_range))
-        across = max(_FEWEST, needed)
-        if across > _MOST:
-            raise DomainError(
-                f"pixel = {plan.pixel * 1e6:.4g} {unit}, pixels = {pixels}: the image would need {across} points "
-                f"across the pupil; expected at most {_MOST} (a smaller image, or n_pupil)",
-                key="n_pupil",
-            )
+        across = max(_FEWEST, plan.points_for(max(_PERIODS * plan.side, plan.side + plan.spread)))
+        plan.require_few(across, _MOST, "n_pupil")
     else:
         across = require_count(across, "n_pupil", 8, _MOST)
-    period = across * plan.wave_over_range
-    if period < side or period < plan.spread:
-        sizes = f"an image of {side * 1e6:.4g} {unit} and spots of {plan.spread * 1e6:.4g} {unit}"
-        raise DomainError(
-            f"n_pupil = {across}: the pattern repeats after {period * 1e6:.4g} {unit}; "
-            f"expected more points for {sizes}",
-            key="n_pupil",
-        )
+    plan.require_points(across)
 
     def waves(field_request: Request, wavelength: float, center: np.ndarray) -> tuple[Wavelets, _Sum]:
         lattice = lattice_wavelets(field_request, wavelength, center, plan.range_of_cosines / across)
@@ -153,24 +147,25 @@ def huygens_psf(
     """Make diffraction images by summing the plane wave of every ray at every pixel.
 
     Parameters and errors are those of :func:`fft_psf`, but for `focal_plane`, which a request holds, and for
-    `sampling` and `n_pupil`, which are those of :meth:`pachon.Request.of`: by default a square lattice, 160 across.
-    Gauss quadrature needs far fewer points where nothing is vignetted.
+    `sampling` and `n_pupil`, which are those of :meth:`pachon.Request.of`: by default a square lattice, 160 to 512
+    across. Gauss quadrature needs far fewer points where nothing is vignetted.
     """
-    request = Request.of(
-        telescope,
-        fields,
-        wavelengths,
-        sampling=sampling,
-        n_pupil=_HUYGENS_ACROSS if n_pupil is None and sampling == "square" else n_pupil,
-        threads=threads,
-    )
+    request = Request.of(telescope, fields, wavelengths, threads=threads)
     plan = _Plan(request, pixel, pixels, reference)
+    plan.require_memory()
+    if n_pupil is None and sampling == "square":
+        n_pupil = max(_HUYGENS_ACROSS, plan.points_for(max(plan.side, plan.spread)))
+        plan.require_few(n_pupil, _HUYGENS_MOST, "fft_psf")
+    plan.request = request = Request.of(request, sampling=sampling, n_pupil=n_pupil)
+    clear = 1.0 - request.telescope.pupil_obscuration**2
+    across = round(2.0 * np.sqrt(len(request.pupil) / (np.pi * clear)))
+    plan.require_points(across)
 
     def waves(field_request: Request, wavelength: float, center: np.ndarray) -> tuple[Wavelets, _Sum]:
         wavelets = traced_wavelets(field_request, wavelength, center)
         return wavelets, lambda x, y: wavelet_sum(wavelets, x, y)
 
-    return plan.image("huygens", waves, round(2.0 * np.sqrt(len(request.pupil) / np.pi)), progress)
+    return plan.image("huygens", waves, across, progress)
 
 
 _Sum = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -215,9 +210,7 @@ class _Plan:
         # The middle of the images weighs all wavelengths alike.
         alike, pupil = relative_weights(None, len(request.wavelengths)), pupil_sampling(request.telescope)
         self.spots = spot_diagram(replace(request, weights=alike, pupil=pupil), reference)
-        if not (self.spots.lit_fraction > 0).all():
-            dark = request.fields[self.spots.lit_fraction <= 0][0]
-            raise DomainError(f"{field_label(dark)}: no light passes; expected a lit pupil")
+        require_light(self.spots)
         #: Range of direction cosines across the pupil: the largest of all fields and directions.
         self.range_of_cosines = range_of_cosines(principal_rays_of(request))
         self.wave_over_range = float(request.wavelengths.min()) / self.range_of_cosines
@@ -228,6 +221,37 @@ class _Plan:
             self.pixel = max(self.wave_over_range / _PER_AIRY, 1.25 * self.spread / self.pixels)
         else:
             self.pixel = require_within(length(pixel, "pixel"), "pixel", *_PIXEL_SIDES, "m")
+        self.side = self.pixel * self.pixels
+        self._unit = "urad" if request.telescope.design_data.afocal else "um"
+
+    def points_for(self, period: float) -> int:
+        """Return the number of points across the pupil whose pattern repeats after a length [m]."""
+        return int(np.ceil(period / self.wave_over_range))
+
+    def require_few(self, across: int, most: int, instead: str) -> None:
+        """Raise a DomainError where a default number of points across the pupil is too large; it says what serves."""
+        if across > most:
+            raise DomainError(
+                f"pixel = {self.pixel * 1e6:.4g} {self._unit}, pixels = {self.pixels}: the image would need {across} "
+                f"points across the pupil; expected at most {most} (a smaller image, or {instead})",
+                key="n_pupil",
+            )
+
+    def require_points(self, across: int) -> None:
+        """Raise a DomainError where so many points across the pupil are too few for the image or the spots."""
+        period = across * self.wave_over_range
+        if period < self.side or period < self.spread:
+            unit = self._unit
+            raise DomainError(
+                f"n_pupil = {across}: the pattern repeats after {period * 1e6:.4g} {unit}; expected more points for "
+                f"an image of {self.side * 1e6:.4g} {unit} and spots of {self.spread * 1e6:.4g} {unit}",
+                key="n_pupil",
+            )
+
+    def require_memory(self) -> None:
+        """Raise a DomainError where the samples of an image are too many."""
+        across = self.pixels * self._samples_across()
+        require_bytes(_BYTES_OF_SAMPLE * across**2, f"pixel = {self.pixel:g} m: {across} samples across the image")
 
     @one_blas_thread()
     def image(
@@ -238,8 +262,7 @@ class _Plan:
         progress: Callable[[int], None] | None,
     ) -> DiffractionPsf:
         """Return the images of all field points from a function that returns wavelets and their sum."""
-        across = self.pixels * self._samples_across()
-        require_bytes(_BYTES_OF_SAMPLE * across**2, f"pixel = {self.pixel:g} m: {across} samples across the image")
+        self.require_memory()
         finer = self._samples()
         images, lit, strehl = [], [], []
         for i, center in enumerate(self.spots.reference_point):

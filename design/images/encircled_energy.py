@@ -19,7 +19,7 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
 from ..drawing import FEW, field_colors, finish_axes, second_scale
-from ..metrics.spots import SpotDiagram, SpotReference, spots
+from ..metrics.spots import SpotDiagram, SpotReference, light_by_distance, spots
 from ..result import FieldResult
 from .diffraction import DiffractionPsf, fft_psf
 
@@ -277,13 +277,12 @@ def _of_spots(diagram: SpotDiagram, radii: np.ndarray | None) -> EncircledEnergy
     rows = []
     for at, weight in zip(distance, diagram.weight, strict=True):
         lit = weight > 0
+        if not lit.any():
+            rows.append(np.nan * radius)
+            continue
         order = np.argsort(at[lit], kind="stable")
-        ray_light = weight[lit][order]
-        # A ray stands in the middle of the light that it carries.
-        within = (np.cumsum(ray_light) - 0.5 * ray_light) / ray_light.sum() if len(ray_light) else np.zeros(0)
-        rows.append(
-            np.interp(radius, at[lit][order], within, left=0.0, right=1.0) if len(ray_light) else np.nan * radius
-        )
+        distances, within = light_by_distance(at[lit][order], weight[lit][order])
+        rows.append(np.interp(radius, distances, within, left=0.0, right=1.0))
     return EncircledEnergy(diagram.request, "geometric", radius, np.stack(rows), diagram.plate_scale)
 
 

@@ -33,7 +33,7 @@ from ..drawing import finish_axes, grid_shape, legend_below, panels_of, second_s
 from ..metrics.principal_rays import PrincipalRays, principal_rays_of
 from ..metrics.spots import spot_diagram
 from ..result import FieldResult
-from .wavelets import lattice_wavelets, range_of_cosines, spot_reach
+from .wavelets import lattice_wavelets, range_of_cosines, require_light, spot_reach
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -192,6 +192,7 @@ def mtf(
     )
     telescope = request.telescope
     principal, diagram = principal_rays_of(request), spot_diagram(request)
+    require_light(diagram)
     period = range_of_cosines(principal) / float(request.wavelengths.min())
     reach = spot_reach(diagram)
     needed = int(np.ceil(2.0 * reach * period))

@@ -189,6 +189,13 @@ def range_of_cosines(principal: PrincipalRays) -> float:
     return largest_range
 
 
+def require_light(diagram: SpotDiagram) -> None:
+    """Raise a DomainError where no light of a field passes."""
+    lit = diagram.lit_fraction > 0
+    if not lit.all():
+        raise DomainError(f"{field_label(diagram.fields[~lit][0])}: no light passes; expected a lit pupil")
+
+
 def spot_reach(diagram: SpotDiagram) -> float:
     """Return the radius that holds nearly all light of the largest of several spots [m]."""
     reach = 0.0

@@ -173,12 +173,7 @@ def distortion(
         lost = request.fields[~np.isfinite(position).all(axis=1)][0]
         raise DomainError(f"{field_label(lost)}: no light reaches the detector")
     scale, rotation, offset = _similarity(slopes, position)
-    ends = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    beside = replace(request.at_fields(_NEAR_AXIS * np.concatenate([ends, 2.0 * ends])), projection="gnomonic")
-    pairs = beside.bundles(request.wavelength, np.zeros((1, 2))).chief_landing().reshape(2, 2, 2, 2)
-    near, far = pairs[:, :, 0] - pairs[:, :, 1]
-    # Distortion of third order adds to the scale with the square of the slope, which two slopes remove.
-    jacobian = (4.0 * near - 0.5 * far).T / (6.0 * _NEAR_AXIS)
+    _, jacobian = axis_scale(request, request.wavelength)
     return Distortion(
         request=request,
         reference=reference,
@@ -188,6 +183,21 @@ def distortion(
         focal_length=scale,
         axis_focal_length=float(np.sqrt(np.abs(np.linalg.det(jacobian)))),
     )
+
+
+def axis_scale(request: Request, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the chief ray of the axis lands [m], shape [2], and the derivatives by slopes there [m], [2, 2].
+
+    The derivatives are those of x and y of the detector (rows) by the slopes of the light.
+    """
+    ends = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    slopes = _NEAR_AXIS * np.concatenate([np.zeros((1, 2)), ends, 2.0 * ends])
+    beside = replace(request.at_fields(slopes), projection="gnomonic")
+    origin, *landing = beside.bundles(wavelength, np.zeros((1, 2))).chief_landing()
+    pairs = np.reshape(landing, (2, 2, 2, 2))
+    near, far = pairs[:, :, 0] - pairs[:, :, 1]
+    # Distortion of third order adds to the scale with the square of the slope, which two slopes remove.
+    return origin, (4.0 * near - 0.5 * far).T / (6.0 * _NEAR_AXIS)
 
 
 def field_lattice(telescope: Telescope, across: int) -> np.ndarray:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ...core.errors import DomainError, unknown_name
 from ...core.threads import thread_count
+from ...models.camera.focal_plane import FocalPlane
 from ...models.design_data import DesignData
 from ...models.media.medium import Medium
 from ...models.surface import Interaction, Surface
@@ -133,8 +134,16 @@ class _Beam:
 class GhostTrace:
     """Light of one star along its own path and those of its ghosts."""
 
-    def __init__(self, telescope: Telescope, start: Rays, coatings: Reflectivities, threads: int | None) -> None:
+    def __init__(
+        self,
+        telescope: Telescope,
+        start: Rays,
+        coatings: Reflectivities,
+        threads: int | None,
+        focal_plane: FocalPlane | None = None,
+    ) -> None:
         self._telescope, self._coatings, self._threads = telescope, coatings, threads
+        self._focal_plane = focal_plane
         self._wavelength = start.wavelength
         self._media: list[Medium] = [telescope.medium_before, *(s.medium_after for s in telescope.surfaces)]
         self._index = refractive_indices(telescope, start.wavelength)
@@ -186,7 +195,9 @@ class GhostTrace:
         weight, coming = beam.weight[lit], beam.direction[lit]
         rays = Rays(beam.position[lit], coming, np.zeros(len(weight)), self._wavelength)
         stretch = self._stretch(surfaces, self._media[places[0] + (behind if turns else before)])
-        for k, met in enumerate(trace(stretch, rays, "all", threads=1)):
+        # Light lands on the CCDs; the detector reflects it at its nominal surface.
+        ccds = self._focal_plane if surfaces[-1].interaction == Interaction.DETECTOR else None
+        for k, met in enumerate(trace(stretch, rays, "all", focal_plane=ccds, threads=1)):
             place, n, n_behind = places[k], self._index[places[k] + before], self._index[places[k] + behind]
             # Cosine of the angle by which the surface turns the ray.
             turn = np.einsum("ij,ij->j", coming.T, met.direction.T)

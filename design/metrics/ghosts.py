@@ -296,7 +296,7 @@ def ghosts(
         raise DomainError(
             f"{telescope.name}: expected at least one lens surface and another, or a detector, for ghosts"
         )
-    light = GhostTrace(telescope, request.launch(request.wavelength), surfaces, threads)
+    light = GhostTrace(telescope, request.launch(request.wavelength), surfaces, threads, request.focal_plane)
     image = light.star()
     if not image.weight.sum() > 0:
         raise DomainError(f"{field_label(request.fields[0])}: the star does not reach the detector")
@@ -304,7 +304,7 @@ def ghosts(
     star = np.average(image.position, axis=0, weights=image.weight)
     if brightest is not None and brightest < len(pairs):
         first_rays = request.launch(request.wavelength, pupil_sampling(telescope, "spiral", _FIRST_RAYS).points)
-        first = GhostTrace(telescope, first_rays, surfaces, threads).ghosts(pairs)
+        first = GhostTrace(telescope, first_rays, surfaces, threads, request.focal_plane).ghosts(pairs)
         peaks = np.array([_measure(landing, 1.0).peak if landing.weight.sum() > 0 else np.nan for landing in first])
         pairs = [pairs[i] for i in sorted(np.argsort(-peaks, kind="stable")[:brightest])]
     landings = []

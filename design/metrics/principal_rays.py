@@ -37,6 +37,10 @@ if TYPE_CHECKING:
 _NEAR = 0.01
 #: Rings of pupil points that focal ratios are fitted to.
 _RINGS = 6
+#: Cosine of the angle between axes of image and sky below which they stand across each other, and 1 less that above
+#: which they are the same.
+_ACROSS = 1e-6
+_SAME = 1e-12
 #: Marginal rays, through the rim of the entrance pupil: along the field (tangential) and across it (sagittal).
 MARGINAL = ("tangential +", "tangential -", "sagittal +", "sagittal -")
 
@@ -244,6 +248,27 @@ def tangential_axes(request: Request) -> np.ndarray:
     radius = np.hypot(*slopes.T)[:, None]
     tangential = np.where(radius > 0, slopes / np.where(radius > 0, radius, 1.0), [0.0, 1.0])
     return np.stack([tangential, np.stack([tangential[:, 1], -tangential[:, 0]], axis=-1)], axis=1)
+
+
+def image_axes(request: Request) -> np.ndarray:
+    """Return unit vectors on the detector along the image of a field and across it, shape [n_field, 2, 2].
+
+    They are the :func:`tangential_axes` where the image has the axes of the sky, upright or inverted; else the nearest
+    orthogonal ones to the motion of the image with the field, such as on a detector that is turned or behind a fold.
+    Their signs are those nearest to the axes of the sky.
+    """
+    axes = tangential_axes(request)
+    slopes = (request.slopes[:, None] + JACOBIAN_STEP * np.concatenate([axes, -axes], axis=1)).reshape(-1, 2)
+    beside = replace(request.at_fields(slopes), projection="gnomonic", focal_plane=None)
+    ends = beside.bundles(request.middle, np.zeros((1, 2))).chief_landing().reshape(-1, 2, 2, 2)
+    moved = ends[:, 0] - ends[:, 1]
+    arrived = np.isfinite(moved).all(axis=(1, 2))
+    left, _, right = np.linalg.svd(np.where(arrived[:, None, None], moved, axes))
+    turned = left @ right
+    along = (turned * axes).sum(axis=-1, keepdims=True)
+    turned = np.where(along < -_ACROSS, -turned, turned)
+    # Differences of landing points would turn axes of symmetry by their rounding.
+    return np.where(np.abs(along) > 1.0 - _SAME, axes, turned)
 
 
 def _focal_ratios(request: Request, axes: np.ndarray) -> np.ndarray:

@@ -125,7 +125,8 @@ class SpotDiagram(FieldResult):
         for i, (radius, weight) in enumerate(zip(radii, weights, strict=True)):
             order = np.argsort(radius[weight > 0], kind="stable")
             if len(order):
-                quantiles[i] = _weighted_quantile(radius[weight > 0][order], weight[weight > 0][order], fraction)
+                distances, within = light_by_distance(radius[weight > 0][order], weight[weight > 0][order])
+                quantiles[i] = np.interp(fraction, within, distances)
         return quantiles
 
     def _summary(self) -> dict[str, Any]:
@@ -252,12 +253,14 @@ def holding_radius(distance: np.ndarray, weight: np.ndarray, fraction: float) ->
     return float(distance[order][np.searchsorted(held, fraction * held[-1])])
 
 
-def _weighted_quantile(values: np.ndarray, weights: np.ndarray, fraction: float) -> float:
-    """Return where ascending values pass a fraction of their weights; values equal but for rounding count as one."""
-    starts = np.flatnonzero(np.diff(values, prepend=-np.inf) > 1e-9 * values[-1])
+def light_by_distance(distances: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distances of rays, ascending as they are given, and the fraction of the light within each.
+
+    Rays stand in the middle of the light that they carry, those of equal distance but for rounding together.
+    """
+    starts = np.flatnonzero(np.diff(distances, prepend=-np.inf) > 1e-9 * distances[-1])
     held = np.add.reduceat(weights, starts)
-    middle = (np.cumsum(held) - 0.5 * held) / held.sum()
-    return float(np.interp(fraction, middle, values[starts]))
+    return distances[starts], (np.cumsum(held) - 0.5 * held) / held.sum()
 
 
 def _draw_spot(axes: Axes, spots: SpotDiagram, i: int, half: float, radius: float) -> None:

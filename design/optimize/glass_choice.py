@@ -160,18 +160,28 @@ def choose_glasses(
     for name in names:
         free = _with_medium(free, name, _medium_of(free, name), name + _MODEL)
 
-    def optimum(start: Telescope, model_names: list[str]) -> Optimum:
-        of_glasses = [f"{name}{_MODEL}.{quantity}" for name in model_names for quantity in ("n", "abbe")]
-        return optimize(replace(state, telescope=start), [*fixed, *of_glasses], merit, **options)
+    bounds = options.get("bounds") or {}
 
-    model = best = optimum(free, names)
-    changes, trials, glass_by_medium = best.changes[: -2 * len(names)], [], {}
+    def optimum(start: Telescope, model_names: list[str], moved: Mapping[str, float]) -> Optimum:
+        of_glasses = [f"{name}{_MODEL}.{quantity}" for name in model_names for quantity in ("n", "abbe")]
+        # Limits of a motion are those of its change from the telescope as it was.
+        shifts = {address: moved[address] for address in bounds if address in moved}
+        remaining = {a: (min(bounds[a][0] - m, 0.0), max(bounds[a][1] - m, 0.0)) for a, m in shifts.items()}
+        moved_options: GlassOptions = {**options, "bounds": {**bounds, **remaining}}
+        return optimize(replace(state, telescope=start), [*fixed, *of_glasses], merit, **moved_options)
+
+    model = best = optimum(free, names, {})
+    count, trials, glass_by_medium = len(best.changes) - 2 * len(names), [], {}
+    motion = np.array([parameter.kind == "motion" for parameter in best.variables[:count]])
+    moves = np.where(motion, best.changes[:count], 0.0)
     for i, name in enumerate(names):
+        moved = {a: float(m) for a, m, is_motion in zip(model.addresses, moves, motion, strict=False) if is_motion}
         optima: list[tuple[float, str, Optimum]] = []
         for glass in _nearest(source, _medium_of(best.telescope, name + _MODEL), nearest):
             medium = source[glass] if telescope.medium_before == VACUUM else source.in_vacuum(glass)
             try:
-                end = optimum(_with_medium(best.telescope, name + _MODEL, medium, glass), names[i + 1 :])
+                start = _with_medium(best.telescope, name + _MODEL, medium, glass)
+                end = optimum(start, names[i + 1 :], moved)
             except PachonError:
                 trials.append(GlassTrial(name, glass, np.inf))
                 continue
@@ -180,12 +190,14 @@ def choose_glasses(
         if not optima:
             raise ConfigError(f"glass {name!r}: no glass of {source.source} near it lets light through")
         _, glass_by_medium[name], best = min(optima, key=lambda one: one[:2])
-        changes = changes + best.changes[: len(changes)]
+        moves = moves + np.where(motion, best.changes[:count], 0.0)
+    start_values, values = model.start_values[:count], np.where(motion, moves, best.values)
     final = replace(
         best,
         start_telescopes=(telescope,),
-        start_values=best.values - changes,
-        changes=changes,
+        start_values=start_values,
+        values=values,
+        changes=values - start_values,
         merits=np.array([model.merits[0], best.merits[1]]),
         remeasured=np.stack([model.remeasured[0], best.remeasured[1]]),
         history=np.concatenate([model.history, best.history[1:]]),
@@ -193,7 +205,7 @@ def choose_glasses(
     )
     if all(name in source for name in names):
         # The glasses of the catalogue near the model's may all be worse than those that the telescope has.
-        kept = optimum(telescope, [])
+        kept = optimum(telescope, [], {})
         trials += [GlassTrial(name, name, float(kept.history[-1])) for name in names]
         if kept.history[-1] <= best.history[-1]:
             final, glass_by_medium = kept, {name: name for name in names}

@@ -286,7 +286,12 @@ def optimization_arguments(
                 if position.name in [s.telescope.name for s in states] and beside.is_file():
                     # Positions of a zoom lens, saved from one telescope, have its name.
                     position = dataclasses.replace(position, name=beside.stem)
-                rays = {k: common[k] if v is None else v for k, v in section.rays().items()}
+                rays = section.rays()
+                for listed, weights in (("fields", "field_weights"), ("wavelengths", "wavelength_weights")):
+                    if rays[listed] is None:
+                        # Weights belong to the points that they are stated with.
+                        rays[listed] = common[listed]
+                        rays[weights] = common[weights] if rays[weights] is None else rays[weights]
                 states.append(
                     DesignConfiguration(
                         position, **rays, weight=section.weight, operands=section.operand_list(), projection=projection

@@ -200,7 +200,7 @@ class ChiefRay(_ExactOperand):
 @check_arguments
 @dataclass(frozen=True)
 class RelativeDistortion(_ExactOperand):
-    """Distance of a chief ray's landing point from that of the axis over ``f tan(theta)``, minus 1.
+    """Distance of a chief ray's landing point from that of the axis over ``f tan(theta)``, f along the field, minus 1.
 
     Parameters
     ----------
@@ -223,15 +223,17 @@ class RelativeDistortion(_ExactOperand):
             raise DomainError(f"operand {self.label}: expected a field off the axis")
 
     def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
-        fields = np.array([*_near_axis(), angles_of(self.field)])
+        near = _near_axis()
+        fields = np.array([*near, *near[:, ::-1], angles_of(self.field)])
         landing, change = _landing(columns, fields, wavelength_of(self.wavelength, columns.telescope))
-        focal, by_focal = _scale(landing[:, :2], change[:, :2])
-        away = landing[:, 2] - landing[:, :2].mean(axis=1)
-        by_away = change[:, 2] - change[:, :2].mean(axis=1)
-        distance = float(np.hypot(*away))
-        perfect = float(np.hypot(*np.tan(fields[2])))
-        ratio = distance / (focal * perfect)
-        return ratio - 1.0, ratio * (away / distance**2 @ by_away - by_focal / focal)
+        # The place without distortion, from the scales along x and along y.
+        slopes = np.tan(fields[4]) / (2.0 * np.tan(0.5 * _SMALL_FIELD))
+        weights = np.array([-slopes[0], slopes[0], -slopes[1], slopes[1]])
+        perfect, by_perfect = landing[:, :4] @ weights, np.einsum("inp,n->ip", change[:, :4], weights)
+        away = landing[:, 4] - landing[:, :4].mean(axis=1)
+        by_away = change[:, 4] - change[:, :4].mean(axis=1)
+        ratio = float(np.hypot(*away) / np.hypot(*perfect))
+        return ratio - 1.0, ratio * (away / (away @ away) @ by_away - perfect / (perfect @ perfect) @ by_perfect)
 
 
 @check_arguments

@@ -2,8 +2,10 @@
 
 import json
 
+import numpy as np
 import pytest
 
+import pachon
 from pachon.commands.cli import main
 
 FIELD = ["--field-deg", "0", "--field-deg", "0.4"]
@@ -86,3 +88,14 @@ def test_bad_input_is_one_line_and_status_2(capsys, in_folder, arguments, parts)
     (line,) = captured.err.splitlines()
     for part in parts:
         assert part in line
+
+
+def test_the_angle_of_a_seidel_diagram_is_that_of_its_field_from_the_axis(capsys):
+    """A field of two angles, and slopes in place of them, are other angles than the root of their squares."""
+    lens, slopes = pachon.load_telescope("tests/data/zmx/lens1.zmx"), np.array([0.15, 0.12])
+    expected = pachon.design.seidel_diagram(lens, field=float(np.arctan(np.hypot(*slopes)))).total
+    for angles, projection in ((np.arctan(slopes), "zemax"), (slopes, "gnomonic")):
+        field = ",".join(f"{angle:.12g}" for angle in np.rad2deg(angles))
+        arguments = ["seidel", "tests/data/zmx/lens1.zmx", "--field-deg", field, "--projection", projection, "--json"]
+        assert main(arguments) == 0
+        assert json.loads(capsys.readouterr().out)["total_waves"] == pytest.approx(expected.tolist(), rel=1e-7)

@@ -123,7 +123,7 @@ def arrays(result):
         (pachon.encircled_energy, {"kind": "geometric", "n_pupil": 64}),
         (pachon.fft_psf, {"n_pupil": 64, "pixels": 16}),
         (pachon.field_curvature, {}),
-        (pachon.huygens_psf, {"n_pupil": 16, "pixels": 16}),
+        (pachon.huygens_psf, {"n_pupil": 32, "pixels": 16}),
         (pachon.design.lateral_color, {}),
         (pachon.mtf, {"n_pupil": 64}),
         (pachon.design.opd_fans, {"n_points": 5}),

@@ -51,6 +51,19 @@ def test_distortion_is_that_of_the_other_metric(lsst_r):
     assert ours.distortion[1:, 0] == pytest.approx(expected[1:], abs=1e-6)
 
 
+def test_distortion_where_scales_differ_along_x_and_y(paraboloid):
+    """On a tilted detector the scale of y is f / cos(tilt), and y goes as 1 / (1 - y' tan(tilt)) beside it; x as f."""
+    telescope, tilt, slope = paraboloid(2.0, 8.0).perturbed("detector", tilt=(0.2, 0.0, 0.0)), 0.2, 5e-3
+    fields = np.arctan([(slope, 0.0), (0.0, slope), (0.0, -slope)])
+    result = pachon.field_curvature(telescope, fields)
+    keystone = [100.0 * (1.0 / (1.0 + sign * slope * np.tan(tilt)) - 1.0) for sign in (1.0, -1.0)]
+    assert result.distortion[0, 0] == pytest.approx(0.0, abs=1e-7)
+    assert sorted(result.distortion[1:, 0]) == pytest.approx(keystone, abs=1e-7)
+    assert result.focal_length[0] == pytest.approx(2.0 / np.sqrt(np.cos(tilt)), rel=1e-7)
+    operands = [100.0 * pachon.design.RelativeDistortion(tuple(f), value=0.0).measure(telescope) for f in fields]
+    assert operands == pytest.approx(result.distortion[:, 0].tolist(), abs=1e-5)
+
+
 def test_a_tilted_field_is_like_one_on_the_axis_of_symmetry(singlet):
     telescope = singlet(2e-3, stop_z=0.01)
     one = pachon.field_curvature(telescope, [(0.0, 0.1)], projection="postel")

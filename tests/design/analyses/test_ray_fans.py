@@ -69,3 +69,17 @@ def test_opd_fans_are_those_of_the_map(lsst_r):
 def test_too_few_rays(paraboloid):
     with pytest.raises(DomainError, match="n_points = 2"):
         pachon.ray_fans(paraboloid(), n_points=2)
+
+
+@pytest.mark.parametrize("angle", [0.7, 0.5 * np.pi, 2.0])
+def test_fans_and_lateral_color_turn_with_the_detector(angle):
+    """Along the image of the field and across it, whatever the axes of the detector are; but for the sign."""
+    telescope = pachon.new_telescope("triplet")
+    turned = telescope.perturbed("Detector", tilt=(0.0, 0.0, angle))
+    fields, waves = np.deg2rad([[0.0, 10.0], [-6.0, 8.0]]), [480e-9, 550e-9, 650e-9]
+    fans, other = (pachon.ray_fans(t, fields, waves, n_points=9).displacement for t in (telescope, turned))
+    assert np.abs(fans).max() > 1e-5
+    np.testing.assert_allclose(np.abs(other), np.abs(fans), rtol=0, atol=1e-11)
+    shift, moved = (pachon.design.lateral_color(t, fields, waves).shift for t in (telescope, turned))
+    assert np.abs(shift).max() > 1e-7
+    np.testing.assert_allclose(np.abs(moved), np.abs(shift), rtol=0, atol=1e-11)

@@ -39,3 +39,14 @@ def test_contradictions(paraboloid):
         pachon.design.spot_matrix(paraboloid(), against="colour")
     with pytest.raises(DomainError, match="defocus = "):
         pachon.design.spot_matrix(paraboloid(), defocus=[np.nan])
+
+
+@pytest.mark.parametrize("sampling", ["gauss", "rings", "spiral", "square"])
+def test_any_sampling_has_as_many_rays_as_it_takes(paraboloid, sampling):
+    """A disc of uniform light."""
+    telescope = paraboloid(2.0, 20.0, shift=1e-3)
+    matrix = pachon.design.spot_matrix(telescope, [[0.0, 0.0]], defocus=[0.0], sampling=sampling)
+    assert matrix.weight.shape[-1] > 300
+    assert matrix.rms_radius[0, 0] == pytest.approx(25e-6 / np.sqrt(2.0), rel=0.01)
+    more = pachon.design.spot_matrix(telescope, [[0.0, 0.0]], defocus=[0.0], sampling="spiral", n_pupil=3000)
+    assert more.weight.shape[-1] == 3000

@@ -4,6 +4,7 @@ from scipy.special import j1
 
 import pachon
 from pachon.core.errors import DomainError
+from pachon.models.aperture import Circle
 
 
 def test_contrast_of_a_wave_through_a_blur_disc(paraboloid):
@@ -47,6 +48,8 @@ def test_vignetting_factors_narrow_the_blur(paraboloid):
     along_x, along_y = (np.sqrt(image.sum(axis=axis) @ place**2 / image.sum()) for axis in (0, 1))
     assert along_x == pytest.approx(25.0, rel=0.01)
     assert along_y == pytest.approx(12.5, rel=0.01)
+    # Half of the pupil is lit, as in spots.
+    assert image.sum() == pytest.approx(pachon.spots(request).lit_fraction[0], rel=1e-12)
 
 
 def test_bars_are_as_wide_as_their_gaps():
@@ -64,5 +67,7 @@ def test_bad_targets(paraboloid):
             pachon.design.target_image(paraboloid(), target)
     with pytest.raises(DomainError, match=r"^field: 2 fields are given; expected one$"):
         pachon.design.target_image(pachon.Request.of(paraboloid(), [[0.0, 0.0], [0.0, 1e-3]]))
+    with pytest.raises(DomainError, match=r"field = .*: no light passes"):
+        pachon.design.target_image(paraboloid(aperture=Circle(0.001, x=1.0)))
     with pytest.raises(DomainError, match="bars = 9"):
         pachon.design.bar_target(64, bars=9)

@@ -121,6 +121,21 @@ def test_fourier_sum_and_huygens_wavelets_agree(angle):
 
 
 @pytest.mark.long
+def test_huygens_wavelets_do_not_repeat_themselves_within_the_image(paraboloid):
+    """As many rays as the image needs by default; too few would add up to more light than there is."""
+    telescope, options = paraboloid(obscuration=0.5), {"pixel": 100e-6, "pixels": 20}
+    image = huygens_psf(telescope, [[0.0, 0.0]], WAVE, **options)
+    # The side of the image over wavelength times focal ratio, 10 um.
+    assert image.n_pupil == 200
+    assert image.inside[0] == pytest.approx(fft_psf(telescope, [[0.0, 0.0]], WAVE, **options).inside[0], abs=5e-3)
+    assert huygens_psf(telescope, [[0.0, 0.0]], WAVE, pixels=8).n_pupil == 160
+    with pytest.raises(DomainError, match=r"n_pupil = 100: the pattern repeats after 1000 um; .* 2000 um"):
+        huygens_psf(telescope, [[0.0, 0.0]], WAVE, n_pupil=100, **options)
+    with pytest.raises(DomainError, match="need 1000 points across the pupil; expected at most 512"):
+        huygens_psf(telescope, [[0.0, 0.0]], WAVE, pixel=500e-6, pixels=20)
+
+
+@pytest.mark.long
 def test_without_a_cut_rim_they_agree_to_a_thousandth():
     telescope = pachon.load_telescope("paul_baker")
     field = [[0.0, np.deg2rad(0.4)]]
@@ -218,5 +233,6 @@ def test_other_errors(lsst_r, paraboloid):
         huygens_psf(lsst_r, reference="middle")
     telescope = paraboloid()
     dark = replace(telescope.surfaces[0], aperture=Circle(0.001, x=1.0))
-    with pytest.raises(DomainError, match="no light passes"):
-        fft_psf(replace(telescope, surfaces=(dark, telescope.surfaces[1])), [[0.0, 0.0]])
+    for image in (fft_psf, huygens_psf, pachon.mtf):
+        with pytest.raises(DomainError, match="no light passes"):
+            image(replace(telescope, surfaces=(dark, telescope.surfaces[1])), [[0.0, 0.0]])

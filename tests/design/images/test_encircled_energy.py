@@ -75,6 +75,16 @@ def test_rays_of_a_defocused_annulus_fill_a_ring(paraboloid):
     assert energy.radius_holding(0.5)[0] == pytest.approx(np.sqrt(0.5 * (inner**2 + outer**2)), rel=0.01)
 
 
+@pytest.mark.parametrize("sampling", ["gauss", "rings"])
+def test_rings_of_rays_at_equal_distances_stand_in_the_middle_of_their_light(paraboloid, sampling):
+    """As in the radii of the spots: the ring above, of a few rings of rays."""
+    diagram = spots(paraboloid(f_number=20.0, obscuration=0.5, shift=1e-3), [[0.0, 0.0]], sampling=sampling, n_pupil=6)
+    for fraction in (0.3, 0.45, 0.6, 0.75):
+        radius = 25e-6 * np.sqrt(0.25 + 0.75 * fraction)
+        assert encircled_energy(diagram).radius_holding(fraction)[0] == pytest.approx(radius, rel=0.01)
+        assert diagram.radius_holding(fraction)[0] == pytest.approx(radius, rel=0.01)
+
+
 def test_light_that_falls_beside_the_image_is_missed(paraboloid):
     psf = fft_psf(paraboloid(f_number=20.0), [[0.0, 0.0]], WAVE, pixels=24)
     energy = encircled_energy(psf)

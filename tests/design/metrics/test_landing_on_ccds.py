@@ -5,6 +5,8 @@ import pytest
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError
+from pachon.design.analyses.coatings import Coatings
+from pachon.design.metrics.ghost_paths import GhostTrace, Reflectivities, ghost_pairs
 
 TELESCOPE = pachon.load_telescope("lsst_v3.3_r")
 LIFT = 20e-6
@@ -46,6 +48,8 @@ def test_a_focal_plane_that_is_lifted_is_a_detector_that_is_moved(analysis):
         lambda r: pachon.ray_fans(r).displacement,
         lambda r: pachon.wavefront_opds(r, grid=8).value,
         lambda r: 1e-9 * pachon.huygens_psf(r, pixels=9, pixel=2e-6, sampling="gauss").image,
+        lambda r: pachon.ghosts(r.at_fields(slice(1)), n_pupil=400, brightest=2).star,
+        lambda r: pachon.design.chromatic_focus(r, zones=[0.8]).focus,
         lambda r: 1e-9 * pachon.mtf(r.at_fields(slice(1)), n_pupil=64).tangential,
     ],
 )
@@ -81,6 +85,17 @@ def test_light_between_the_ccds_is_lost():
     on_ccd = LIFTED.ccd_at(*landing.T) >= 0
     assert lit[0] == pytest.approx(nominal.weight[0, 0][on_ccd].sum(), abs=1e-12)
     assert 0.1 < lit[0] / nominal.lit_fraction[0] < 0.9
+
+
+def test_ghosts_between_the_ccds_are_lost():
+    request, plane = pachon.Request.of(TELESCOPE, FIELDS[:1], 620e-9, n_pupil=8), pachon.FocalPlane.flat()
+    surfaces = Reflectivities(TELESCOPE, None, 0.15, Coatings(), 620e-9)
+    pairs = [p for p in ghost_pairs(TELESCOPE) if "Filter_exit" in {TELESCOPE.surface_names[i] for i in p}]
+    traces = [GhostTrace(TELESCOPE, request.launch(620e-9), surfaces, 1, on) for on in (None, plane)]
+    full, cut = (list(t.ghosts(pairs)) for t in traces)
+    on_ccds = [ghost.weight[plane.ccd_at(*ghost.position.T) >= 0].sum() for ghost in full]
+    assert [ghost.weight.sum() for ghost in cut] == pytest.approx(on_ccds, rel=1e-12)
+    assert sum(on_ccds) < 0.99 * sum(ghost.weight.sum() for ghost in full)
 
 
 def test_a_focal_plane_beside_one_or_where_it_means_nothing_is_refused():

@@ -297,6 +297,33 @@ def test_glasses_stay_where_no_other_is_better(doublet, monkeypatch):
     assert found.trials[1].rms < 0.1 * found.trials[0].rms
 
 
+@pytest.mark.long
+def test_motions_beside_glasses_count_from_the_telescope_as_it_was(lens, monkeypatch):
+    """Glass by glass all is optimised again; the limits and numbers of a motion are those of all of it."""
+    crowns = lens([(np.inf, 4.0, "N-BK7"), (np.inf, 2.0, "N-BAK4"), (np.inf, 100.0, "")], pupil=5.0, field_deg=0.5)
+    # A glass that the catalogue does not have cannot stay.
+    own = glass_choice._with_medium(crowns, "N-BAK4", crowns.surface("S2").medium_after, "crown")
+    start = apply(own, {"S1.curvature": -15.0, "S2.curvature": 5.0})
+    monkeypatch.setattr(glass_choice, "_nearest", lambda *_: ["N-SF5"])
+    found = pachon.design.choose_glasses(
+        start,
+        [*ACHROMAT, "Image.dz"],
+        ["crown"],
+        fields=[[0.0, 0.0]],
+        wavelengths=[D, F, C],
+        targets=[pachon.design.FocalLength(0.11)],
+        bounds={"Image.dz": (-2e-3, 2e-3)},
+        n_pupil=2,
+        solver=pachon.design.LeastSquares(max_steps=12, constraint_tolerance=np.inf),
+    )
+    assert found.glasses == {"crown": "N-SF5"}
+    moved = found.optimum.telescope.surfaces[-1].vertex[2] - start.surfaces[-1].vertex[2]
+    assert moved == pytest.approx(-2e-3, rel=1e-6)
+    assert (found.optimum.start_values[3], found.optimum.values[3]) == (0.0, pytest.approx(moved))
+    assert found.optimum.start_values[:3] == pytest.approx([-15.0, 5.0, 0.0])
+    assert found.optimum.values == pytest.approx(found.optimum.start_values + found.optimum.changes)
+
+
 @pytest.mark.parametrize(
     ("variables", "options", "error", "words"),
     [

@@ -120,6 +120,24 @@ def test_wrong_files(arguments, tmp_path, text, words):
     assert "\n" not in str(caught.value)
 
 
+def test_weights_belong_to_the_points_that_they_are_stated_with(arguments):
+    states = arguments(
+        f"""
+        variables: [S1.curvature]
+        fields_deg: [[0, 0], [0, 5], [0, 10]]
+        field_weights: [1, 1, 5]
+        wavelengths_nm: [500, 600]
+        wavelength_weights: [1, 2]
+        configurations:
+          - {{telescope: {LENS}, fields_deg: [[0, 0], [0, 3]]}}
+          - {{telescope: {LENS}, wavelengths_nm: [550, 650], field_weights: [2, 1, 1]}}
+        """
+    )["telescope"]
+    weights = [[None if w is None else [*w] for w in (s.field_weights, s.wavelength_weights)] for s in states]
+    assert weights == [[[1, 1, 5], [1, 2]], [None, [1, 2]], [[2, 1, 1], None]]
+    assert [len(s.fields) for s in states] == [3, 2, 3]
+
+
 def test_the_catalogue_of_glasses(tmp_path):
     """A maker, or a file beside that of the optimisation; by default that of common glasses."""
     path = tmp_path / "opt.yaml"
