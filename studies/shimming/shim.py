@@ -169,6 +169,7 @@ def shim(
     reporter = Reporter(quiet=True) if reporter is None else reporter
     plane, names = experiment.focal_plane, experiment.config.ccds or ()
     fit, check = (Places.gauss(plane, names, order) for order in (_FIT[merit], _CHECK))
+    named_parts = _parts_with_places(plane, fit, parts)
     heights = fit.heights(plane)
     with reporter.stage("widths and ellipticities against height"):
         curves = focus_curves(experiment, fit, float(np.abs(heights).max()) + _ROOM, threads)
@@ -184,7 +185,6 @@ def shim(
         (focus,) = _best_motions(curves, fit, heights, whole_plane, merit, pairs)
         (level,) = _best_motions(curves, fit, np.zeros_like(heights), whole_plane, merit, pairs)
         focused = heights + _height_change(focus, fit.position)
-        named_parts = _parts_with_places(plane, fit, parts)
         best = _best_motions(curves, fit, focused, [(center, rows) for _, center, rows in named_parts], merit, pairs)
     motions = {name: motion for (name, *_), motion in zip(named_parts, best, strict=True)}
     shimmed = focused.copy()
@@ -262,7 +262,7 @@ def _parts_with_places(
     raft = camera.raft_index[places.ccd]
     if (raft < 0).any():
         name = camera.ccd_names[places.ccd[raft < 0][0]]
-        raise ConfigError(f"parts = rafts: expected ccds, as {name} of {camera.name} is on no raft")
+        raise ConfigError(f"parts = rafts: expected ccds, as {name} of {camera.name} is on no raft", key="parts")
     centers = {i: camera.centers[camera.raft_index == i].mean(axis=0) for i in np.unique(raft)}
     return [(camera.raft_names[i], center, np.flatnonzero(raft == i)) for i, center in centers.items()]
 

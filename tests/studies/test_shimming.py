@@ -227,6 +227,17 @@ def test_bad_arguments_are_one_line(capsys):
     assert "focal_plane.heights = nowhere: expected lsstcam" in capsys.readouterr().err
 
 
+def test_ccds_without_rafts_are_refused_before_the_images_are_made(monkeypatch, tmp_path, capsys):
+    """HSC's, whose curves of focus take half a minute for four CCDs."""
+    monkeypatch.setattr("pachon.studies.shimming.shim.focus_curves", lambda *_: pytest.fail("curves were computed"))
+    assert main(["shim", "--set", "telescope=hsc", "--ccds", "hsc049", "-o", str(tmp_path / "out")]) == 2
+    assert (
+        capsys.readouterr()
+        .err.splitlines()[-1]
+        .endswith("--parts = rafts: expected ccds, as hsc049 of hsc is on no raft")
+    )
+
+
 @pytest.mark.long
 def test_measured_shapes_are_those_of_hsm(built):
     """GalSim's adaptive moments of the same images; T of its sigma, which is that of the determinant."""
