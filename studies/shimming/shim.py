@@ -378,12 +378,14 @@ def _state_metrics(
 
 
 def draw_shims(ax: Axes | Figure | None, planes: Mapping[str, FocalPlane]) -> Figure:
-    """Draw focal planes of one camera by name, on the scale of the first."""
+    """Draw focal planes of one camera by name, on one scale."""
     first = next(iter(planes.values()))
     camera = first.camera
     edge = 1.04e3 * camera.reach
     limits = (-edge, edge, -edge, edge)
-    bounds = 3e6 * float(np.std(first.height(*camera.centers.T))) or 1.0
+    # The focus of the whole, too: beside it the heights of a flat focal plane are rounding.
+    heights = np.array([1e6 * plane.height(*camera.centers.T) for plane in planes.values()])
+    bounds = float((np.abs(heights.mean(axis=1)) + 3.0 * heights.std(axis=1)).max()) or 1.0
     with styled():
         figure = figure_at(ax, 13.0, 4.6)
         panels = figure.subplots(1, len(planes))
