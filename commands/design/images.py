@@ -47,7 +47,9 @@ def _pixels_text(s: dict[str, Any]) -> str:
 def psf(
     shared: SharedOptions,
     huygens: Annotated[bool, Option("--huygens", help="Sum the wave of every ray at every pixel.")] = False,
-    pixel_um: Annotated[float | None, Option(help="Distance of pixels [um]; λf/5 or more by default.")] = None,
+    pixel_um: Annotated[
+        float | None, Option(min=1e-6, max=1e6, help="Distance of pixels [um]; λf/5 or more by default.")
+    ] = None,
     pixels: Annotated[int, Option(min=16, max=4096, help="Pixels on a side.")] = 128,
     pupil_points: PupilPoints = None,
     out: Annotated[Path | None, Option("--out", "-o", help="FITS file of the images to write, [field, y, x].")] = None,
