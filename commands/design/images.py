@@ -28,8 +28,8 @@ def _pixels_text(s: dict[str, Any]) -> str:
     pixel, unit = (s["pixel_urad"], "µrad") if "pixel_urad" in s else (s["pixel_um"], "µm")
     return (
         f"{s['pixels']} x {s['pixels']} pixels of {pixel:.4g} {unit}; inside: of the light, within the "
-        f"{s['pixels'] * pixel:.4g} {unit} of the image; lit: of the annular pupil. {s['pupil_points']} points "
-        "across the pupil."
+        f"{s['pixels'] * pixel:.4g} {unit} of the image; lit: of the annular pupil; a dash: too narrow for the pixels. "
+        f"{s['pupil_points']} points across the pupil."
     )
 
 
@@ -113,13 +113,12 @@ def ee(
     - `pachon ee lsst_v3.3_i --wavelength-nm 750 --field-deg 0 --field-deg 1 --field-deg 1.4 --field-deg 1.75`
     - `pachon ee my_lens.zmx --geometric --across-band 5 --json`
     """
-    from ...design.images.diffraction import fft_psf
-    from ...design.images.encircled_energy import encircled_energy
+    from ...design.images.encircled_energy import diffracted_energy, encircled_energy
 
     if geometric:
         return encircled_energy(shared.request, kind="geometric")
     with shared.stage("encircled energy", shared.images) as progress:
-        return encircled_energy(fft_psf(shared.request, pixels=pixels, n_pupil=pupil_points, progress=progress))
+        return diffracted_energy(shared.request, pixels=pixels, n_pupil=pupil_points, progress=progress)
 
 
 @design_command(

@@ -20,9 +20,14 @@ if TYPE_CHECKING:
 
 #: Interpolated samples across the bright part of an image, on which widths are measured.
 _SAMPLES = 512
-#: Irradiance, over that of the peak, down to which an image is interpolated, and pixels beyond: half suffices of the
-#: irradiance, less where the peak is between pixels.
-_BRIGHT, _RIM = 0.3, 8
+#: Irradiance over that of the peak down to which an image is interpolated; the peak may be between pixels.
+_BRIGHT = 0.3
+#: Pixels beyond the bright ones, for the splines.
+_RIM = 8
+#: Width [pixels] below which that of an image of coarse pixels is not known.
+_NARROW = 2.5
+#: Coarse pixels over wavelength times focal ratio.
+_COARSE = 0.75
 #: Decades below the brightest pixel that the plot shows.
 _DECADES = 4.0
 #: Images whose cuts are drawn.
@@ -112,9 +117,19 @@ class DiffractionPsf(FieldResult):
         return np.sqrt(mean - (self.centroid**2).sum(axis=1))
 
     @property
+    def undersampled(self) -> np.ndarray:
+        """Whether pixels are larger than half of wavelength times focal ratio, shape [n_field] bool."""
+        return self.pixel > self.airy_radius / 2.44
+
+    @property
     def fwhm(self) -> np.ndarray:
-        """Diameter of a disc with the area above half the peak of each image [m], shape [n_field]."""
-        return self.pixel * np.array([_width(image) for image in self.image])
+        """Diameter of a disc with the area above half the peak of each image [m], shape [n_field].
+
+        NaN of an image narrower than two and a half pixels of more than three quarters of wavelength times focal ratio.
+        """
+        width = np.array([_width(image) for image in self.image])
+        coarse = self.pixel > _COARSE * self.airy_radius / 1.22
+        return self.pixel * np.where(coarse & (width < _NARROW), np.nan, width)
 
     def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
@@ -171,11 +186,11 @@ def pixel_axis(pixel: float, pixels: int) -> np.ndarray:
 def _width(image: np.ndarray) -> float:
     """Return the diameter of a disc with the area above half the peak of an image [pixel]."""
     bright = image > _BRIGHT * image.max()
-    part = image[_range_of(bright.any(axis=1)), _range_of(bright.any(axis=0))]
-    factor = max(1, -(-_SAMPLES // max(part.shape)))
-    finer = zoom(part, factor, order=5, mode="mirror")
+    bright_image = image[_range_of(bright.any(axis=1)), _range_of(bright.any(axis=0))]
+    factor = max(1, -(-_SAMPLES // max(bright_image.shape)))
+    finer = zoom(bright_image, factor, order=5, mode="mirror")
     # The first and the last samples are pixel centres.
-    area = (part.shape[0] - 1) / (finer.shape[0] - 1) * (part.shape[1] - 1) / (finer.shape[1] - 1)
+    area = (bright_image.shape[0] - 1) / (finer.shape[0] - 1) * (bright_image.shape[1] - 1) / (finer.shape[1] - 1)
     return float(2.0 * np.sqrt((finer > 0.5 * finer.max()).sum() * area / np.pi))
 
 
@@ -200,8 +215,9 @@ def _draw_image(axes: Axes, psf: DiffractionPsf, i: int, fwhm: float) -> AxesIma
     axes.set(xticks=[], yticks=[])
     axes.set_title(psf.field_labels()[i], fontsize=9.5)
     lit = "" if psf.lit_fraction[i] > 0.995 else f"lit {100 * psf.lit_fraction[i]:.1f} % of the pupil"
+    width = psf.size_text(fwhm, float(psf.plate_scale[i])) if np.isfinite(fwhm) else "within some pixels"
     axes.set_xlabel(
-        f"Strehl {psf.strehl[i]:.3g}\nFWHM {psf.size_text(fwhm, float(psf.plate_scale[i]))}\n{lit}",
+        f"Strehl {psf.strehl[i]:.3g}\nFWHM {width}\n{lit}",
         fontsize=7.5,
     )
     return shown

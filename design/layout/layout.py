@@ -43,8 +43,10 @@ _STOP = "#000000"
 _STOP_BAR = 0.1
 #: Lenses and detector have a panel of their own below this fraction of the whole size.
 _SMALL = 0.4
-#: Letters of a name that there is room for above a drawing, and height of a picture for each more [inch].
-_SHORT_NAME, _NAME_HEIGHT = 14, 0.06
+#: Letters of a name that there is room for above a drawing.
+_SHORT_NAME = 14
+#: Height of a picture for each more [inch].
+_NAME_HEIGHT = 0.06
 
 
 @dataclass(frozen=True)
