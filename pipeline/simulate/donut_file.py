@@ -145,6 +145,11 @@ def simulate_donuts(
     shift = float(np.reshape(model.detector.shifts(1), ()))
     model = replace(model, air=replace(model.air, fwhm=scene.seeing_arcsec * ARCSEC))
     if scene.layout == "corners":
+        if telescope.camera not in (None, "lsst"):
+            raise ConfigError(
+                f"layout = corners: {telescope.name} has the camera {telescope.camera}; expected the LSST's, or random",
+                key="layout",
+            )
         corners = corner_stars(telescope)
         fields, defocus = corners.fields, corners.heights + shift
     else:

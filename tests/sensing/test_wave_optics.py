@@ -8,6 +8,7 @@ from scipy import fft
 from scipy.ndimage import map_coordinates
 
 import pachon
+from pachon.core.errors import ConfigError
 from pachon.models.zernike_polynomials import annular_zernikes
 from pachon.pipeline.simulate import donut_file
 from pachon.pipeline.simulate.donut_file import DonutScene, simulate_donuts
@@ -188,3 +189,9 @@ def test_zernikes_of_simulated_donuts_are_those_of_the_light():
     left -= terms[:, :3] @ np.linalg.lstsq(terms[:, :3], left, rcond=None)[0]
     # Of a change of 120 nm; terms beyond Z22 leave the rest.
     assert np.std(left) < 1.5e-9
+
+
+def test_corner_sensors_are_those_of_the_lsst_alone():
+    hsc = pachon.load_telescope("hsc")
+    with pytest.raises(ConfigError, match="layout = corners: hsc has the camera hsc; expected the LSST's, or random"):
+        simulate_donuts(hsc, hsc, DonutScene(layout="corners"), pachon.DonutModel(detector=pachon.DonutDetector(1e-3)))
