@@ -112,8 +112,8 @@ def zernikes(
         str | None,
         choice(
             ("full", "lit"),
-            help="full: the whole annulus, orthogonal; lit: where light passes, the default if that is less than 80 % "
-            "anywhere.",
+            help="full: the whole annulus, orthogonal; lit: where light passes, the default where stopped rays would "
+            "spoil the terms.",
         ),
     ] = None,
     over_field: Annotated[bool, Option("--map", help="Maps over the field of view.")] = False,

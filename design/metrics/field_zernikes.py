@@ -37,9 +37,13 @@ FittedPupil = Literal["full", "lit"]
 ZernikeOrdering = Literal["noll", "fringe"]
 #: Maps of single terms in one plot.
 _MAPS = 8
-#: Least lit part of the annulus whose unlit rays are traced as if they passed: beyond, they run so far outside the
-#: apertures that aspheres bend them by many waves (HSC at 0.64 degrees, two thirds lit: 64 um rms in place of 0.8).
-_LEAST_LIT = 0.8
+#: Terms by which it is found whether the wavefront of the whole annulus is one of Zernikes.
+_SMOOTH_TERMS = 28
+#: Lit part of the annulus from which on it is.
+_MOSTLY_LIT = 0.95
+#: Largest rms residual of these terms over the wavelength, that of a diffraction-limited image. Aspheres bend rays far
+#: outside their apertures by many waves: 34 are left at 0.64 degrees of HSC, two thirds lit; 0.014 at 1.83 of the LSST.
+_SMOOTH_RESIDUAL = 1.0 / 14.0
 
 
 @dataclass(frozen=True)
@@ -265,10 +269,22 @@ def wavefront_zernikes(
 
 
 def pupil_to_fit(request: Request) -> FittedPupil:
-    """Return "full" where at least four fifths of the annulus are lit at every field of a request, else "lit"."""
-    lit = np.concatenate([_wavefronts(batch)[1] for _, batch in request.parts()])
+    """Return "full", or "lit" where the rays that apertures stop at a field of a request have no smooth wavefront."""
+    count = min(_SMOOTH_TERMS, len(request.pupil))
+    x, y = request.unit_pupil.T
+    terms = annular_zernikes(count, x, y, request.telescope.pupil_obscuration).T
     weights = request.pupil.weights
-    return "full" if (lit @ weights).min() >= _LEAST_LIT * weights.sum() else "lit"
+    for _, batch in request.parts():
+        value, lit = _wavefronts(batch)
+        stopped = lit @ weights < _MOSTLY_LIT * weights.sum()
+        if not np.isfinite(value).all():
+            return "lit"
+        if stopped.any():
+            used = np.ones_like(lit[stopped])
+            _, residual = _fit(terms, value[stopped], used, weights, batch.fields[stopped], "full")
+            if residual.max() > _SMOOTH_RESIDUAL * request.wavelength:
+                return "lit"
+    return "full"
 
 
 def _wavefronts(request: Request) -> tuple[np.ndarray, np.ndarray]:

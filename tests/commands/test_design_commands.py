@@ -167,7 +167,8 @@ def test_zernikes_of_strongly_vignetted_fields_are_those_of_the_light(capsys, in
     assert main(["zernikes", "hsc", "--jmax", "11", "--pupil", "lit", "--json"]) == 0
     assert by_default == json.loads(capsys.readouterr().out)
     assert np.abs(by_default["zernike_nm"]).max() < 1500.0
-    assert main(["zernikes", "lsst_v3.3_r", "--jmax", "11", "--json"]) == 0
+    # The LSST lights 70 % of it at the rim of its wavefront sensors, where stopped rays have a smooth wavefront.
+    assert main(["zernikes", "lsst_v3.3_r", "--field-deg", "1.83", "--jmax", "11", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["pupil"] == "full"
     assert main(["zernikes", "hsc", "--pupil", "full"]) == 2
     assert "pupil = lit" in capsys.readouterr().err
