@@ -173,7 +173,9 @@ def _focused(options: TelescopeOptions, header: HeaderValues, file: Path) -> Tel
     from ..sensing.stamp_headers import TELESCOPE_KEY
 
     try:
-        return options.load(header.model or DEFAULT_TELESCOPE)[1]
+        beside = None if header.telescope is None else file.parent / header.telescope
+        named = header.model if beside is None or not beside.is_file() else str(beside)
+        return options.load(named or DEFAULT_TELESCOPE)[1]
     except PachonError as error:
         if options.telescope is not None or header.telescope is None:
             raise

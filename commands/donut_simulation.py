@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.errors import ConfigError
@@ -34,6 +36,13 @@ def simulate_file(options: TelescopeOptions, simulation: SimulationOptions) -> N
     ).with_light(wavelength_list(telescope, options.wavelength_nm, None))
     with interruptible(options.quiet) as reporter, reporter.stage("donuts"):
         donuts = simulate_donuts(telescope, true, scene, model, options.field())
-    write_donuts(options.files[0], donuts, scene, model, name)
+    write_donuts(options.files[0], donuts, scene, model, _name_beside(options.files[0], name))
     if not options.quiet:
         print_line(f"{options.files[0]}: {counted(len(donuts.fields), 'donut')}, moved: {model.detector.moved}")
+
+
+def _name_beside(file: Path, model: str) -> str:
+    """Return a bundled name or an absolute path as it is, another path as it is from the folder of a file."""
+    if not Path(model).is_file() or Path(model).is_absolute():
+        return model
+    return os.path.relpath(model, file.parent)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 from typer import Option
 
+from ..core.errors import ConfigError
 from ..core.number_text import NumberText
 from ..core.terminal import print_line
 from . import completion
@@ -81,13 +82,16 @@ def shim_command(
     )
     make_folder(out)
     with interruptible(quiet) as reporter:
-        shims = shim(
-            experiment,
-            merit=cast("ShimMerit", merit),
-            parts=cast("ShimmedParts", parts),
-            threads=threads,
-            reporter=reporter,
-        )
+        try:
+            shims = shim(
+                experiment,
+                merit=cast("ShimMerit", merit),
+                parts=cast("ShimmedParts", parts),
+                threads=threads,
+                reporter=reporter,
+            )
+        except ConfigError as error:
+            raise error.renamed("--parts") if error.key == "parts" else error from None
     write_shims(shims, out, experiment)
     rows = _state_rows(shims)
     write_rows(rows, table)

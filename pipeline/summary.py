@@ -104,11 +104,10 @@ def bins_up_to(longest: float, exact: bool | None = None) -> SeparationBins:
 def ccd_metrics(product: CcdProduct) -> dict[str, Any]:
     """Return the metrics of one CCD; keys end in their unit."""
     holdout, observed = product.holdout, product.observed
-    field = np.array([np.median(holdout.field_x), np.median(holdout.field_y)])
     return {
         "x_mm": product.center[0] * 1e3,
         "y_mm": product.center[1] * 1e3,
-        "field_deg": float(np.rad2deg(np.hypot(*field))),
+        "field_deg": float(np.rad2deg(np.hypot(*_field_of_middle(product)))),
         "stars_with_defects": int((observed.defects != 0).sum()),
         "fwhm_arcsec": finite_median(holdout.fwhm) / ARCSEC,
         "pixels_rejected": product.model.n_rejected,
@@ -118,6 +117,17 @@ def ccd_metrics(product: CcdProduct) -> dict[str, Any]:
         **_colour_metrics(product),
         **_common_metrics([product]),
     }
+
+
+def _field_of_middle(product: CcdProduct) -> np.ndarray:
+    """Return the field angle of the middle of a CCD [rad], by a plane through those of its holdout positions."""
+    stars = product.holdout
+    fields = np.stack([stars.field_x, stars.field_y], axis=-1)
+    offsets = np.stack([stars.x, stars.y], axis=-1) - product.center
+    plane = np.column_stack([np.ones(len(offsets)), offsets])
+    if np.linalg.matrix_rank(plane) < plane.shape[1]:
+        return np.median(fields, axis=0)
+    return np.linalg.lstsq(plane, fields, rcond=None)[0][0]
 
 
 def _colour_metrics(product: CcdProduct) -> dict[str, Any]:

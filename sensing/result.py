@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 #: Donuts of one picture unless others are asked for.
 _SHOWN = 6
+#: Pixels shown beyond those that have a model.
+_RIM = 8
 #: Range of the residuals over their standard deviation.
 _RANGE = 5.0
 #: Meaning of the columns of the table.
@@ -373,6 +375,11 @@ def _draw(fit: DonutFit, donuts: slice | list[int] | None, ax: Axes | Figure | N
                 seeing = float(arcseconds(fit.fwhm[i]))
                 quality = fit.chi2[i] / fit.n_pixels[i]
                 panels[2, column].set_xlabel(f'x [pixel]\nFWHM {seeing:.2f}"\nchi2/pixel {quality:.2f}', fontsize=8)
+        fitted = np.isfinite(fit.model[shown_donuts]).any(axis=0)
+        if fitted.any():
+            # Stamps may be many times as large as donuts.
+            (bottom, top), (left, right) = (np.flatnonzero(fitted.any(axis=a))[[0, -1]] for a in (1, 0))
+            panels[0, 0].set(xlim=(left - _RIM, right + _RIM), ylim=(bottom - _RIM, top + _RIM))
         for row, name in enumerate(("image", "model", "residual / noise")):
             panels[row, 0].set_ylabel(f"{name}\ny [pixel]")
         upper.colorbar(shown, ax=panels[:2], fraction=0.02, pad=0.01, label="light over each star's brightest")
@@ -392,7 +399,7 @@ def _draw(fit: DonutFit, donuts: slice | list[int] | None, ax: Axes | Figure | N
             )
         name_terms(bars, fit.noll)
         bars.set_ylabel("rms over the annulus [nm], OCS")
-        bars.legend(loc="best", ncols=3, fontsize=7)
+        bars.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=6, fontsize=7, frameon=False)
         waves = ", ".join(f"{w * 1e9:.4g}" for w in fit.wavelengths)
         figure.suptitle(
             f"{plain_text(fit.telescope)}: donuts at {waves} nm, wavefront beyond the telescope's own", fontsize=11

@@ -258,7 +258,8 @@ def _draw_bars(axes: Axes, zernikes: ZernikeFit) -> None:
     axes.set_xlim(1.3, j[-1] + 0.7)
     largest = float(np.abs(zernikes.coefficients[1:]).max()) * 1e9
     # Tilt is often far larger than all other terms; a scale that is linear about zero shows them too.
-    axes.set_yscale("symlog", linthresh=max(largest / 100.0, 1e-3))
+    # A power of ten, so that no tick is nearer to zero.
+    axes.set_yscale("symlog", linthresh=10.0 ** np.floor(np.log10(max(largest / 100.0, 1e-3))))
     axes.grid(True, axis="y", color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.set(xlabel="Noll index", ylabel="coefficient = rms over the annulus [nm]")

@@ -28,8 +28,8 @@ def _pixels_text(s: dict[str, Any]) -> str:
     pixel, unit = (s["pixel_urad"], "µrad") if "pixel_urad" in s else (s["pixel_um"], "µm")
     return (
         f"{s['pixels']} x {s['pixels']} pixels of {pixel:.4g} {unit}; inside: of the light, within the "
-        f"{s['pixels'] * pixel:.4g} {unit} of the image; lit: of the annular pupil. {s['pupil_points']} points "
-        "across the pupil."
+        f"{s['pixels'] * pixel:.4g} {unit} of the image; lit: of the annular pupil; a dash: too narrow for the pixels. "
+        f"{s['pupil_points']} points across the pupil."
     )
 
 
@@ -47,7 +47,9 @@ def _pixels_text(s: dict[str, Any]) -> str:
 def psf(
     shared: SharedOptions,
     huygens: Annotated[bool, Option("--huygens", help="Sum the wave of every ray at every pixel.")] = False,
-    pixel_um: Annotated[float | None, Option(help="Distance of pixels [um]; λf/5 or more by default.")] = None,
+    pixel_um: Annotated[
+        float | None, Option(min=1e-6, max=1e6, help="Distance of pixels [um]; λf/5 or more by default.")
+    ] = None,
     pixels: Annotated[int, Option(min=16, max=4096, help="Pixels on a side.")] = 128,
     pupil_points: PupilPoints = None,
     out: Annotated[Path | None, Option("--out", "-o", help="FITS file of the images to write, [field, y, x].")] = None,
@@ -111,13 +113,12 @@ def ee(
     - `pachon ee lsst_v3.3_i --wavelength-nm 750 --field-deg 0 --field-deg 1 --field-deg 1.4 --field-deg 1.75`
     - `pachon ee my_lens.zmx --geometric --across-band 5 --json`
     """
-    from ...design.images.diffraction import fft_psf
-    from ...design.images.encircled_energy import encircled_energy
+    from ...design.images.encircled_energy import diffracted_energy, encircled_energy
 
     if geometric:
         return encircled_energy(shared.request, kind="geometric")
     with shared.stage("encircled energy", shared.images) as progress:
-        return encircled_energy(fft_psf(shared.request, pixels=pixels, n_pupil=pupil_points, progress=progress))
+        return diffracted_energy(shared.request, pixels=pixels, n_pupil=pupil_points, progress=progress)
 
 
 @design_command(

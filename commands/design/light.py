@@ -105,7 +105,7 @@ def target(
         Path | None, Option(metavar="PICTURE", help="Picture to image, .png, in place of bars; its grey values.")
     ] = None,
     width_arcsec: Annotated[
-        float | None, Option(min=0.0, help="Width of the target; 60 Airy radii by default.")
+        float | None, Option(min=1e-9, help="Width of the target; 60 Airy radii by default.")
     ] = None,
     bars: Annotated[int, Option(min=1, max=12, help="Bars of each kind.")] = 3,
     rays: Annotated[int, Option(min=1, max=100_000, help="Rays of each pixel of the target.")] = 400,

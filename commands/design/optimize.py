@@ -38,9 +38,13 @@ _EXAMPLE = "M2.dx,M1.radius"
 
 
 def _largest_terms(result: Any) -> list[str]:
-    """Return the three Noll terms of each parameter that change most over the fields."""
+    """Return the three Noll terms of each parameter that change most over the fields; a dash where none does."""
     size = (result.matrix[:, 3:] ** 2).mean(axis=0) ** 0.5
-    return [", ".join(f"Z{j}" for j in terms) for terms in (size.argsort(axis=0)[::-1][:3] + 4).T]
+    largest = size.argsort(axis=0)[::-1][:3]
+    return [
+        ", ".join(f"Z{row + 4}" for row in rows if of_parameter[row] > 0) or "-"
+        for rows, of_parameter in zip(largest.T, size.T, strict=True)
+    ]
 
 
 def _sensitivity_verdict(summary: dict[str, Any]) -> str:

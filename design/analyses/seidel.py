@@ -91,8 +91,8 @@ class SeidelDiagram(Analysis):
         axes.axvline(len(self.names) - 0.5, color="0.3", linewidth=0.9)
         largest = float(np.abs(bars).max())
         if largest > 100.0 * float(np.abs(self.total).max()):
-            # The sums would be too small to be visible.
-            axes.set_yscale("symlog", linthresh=max(largest / 1000.0, 1e-9))
+            # The sums would be too small to be visible. A power of ten, so that no tick is nearer to zero.
+            axes.set_yscale("symlog", linthresh=10.0 ** np.floor(np.log10(max(largest / 1000.0, 1e-9))))
         names = [*map(plain_text, self.names), "sum"]
         crowded = len(names) > _CROWDED
         axes.set_xticks(
@@ -107,7 +107,8 @@ class SeidelDiagram(Analysis):
         axes.set(ylabel="wavefront [waves]", xlim=(-0.5, len(bars) - 0.5))
         axes.grid(True, axis="y", color="0.92", linewidth=0.6)
         axes.set_axisbelow(True)
-        axes.legend(fontsize=7, ncols=2)
+        # Above the bars, which fill the diagram in no order.
+        axes.legend(fontsize=7, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
 
 
 @check_arguments

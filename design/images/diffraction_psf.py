@@ -18,8 +18,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-#: Factor of the interpolated pixels along each axis, on which widths are measured.
-_FINER = 4
+#: Interpolated samples across the bright part of an image, on which widths are measured.
+_SAMPLES = 512
+#: Irradiance over that of the peak down to which an image is interpolated; the peak may be between pixels.
+_BRIGHT = 0.3
+#: Pixels beyond the bright ones, for the splines.
+_RIM = 8
+#: Width [pixels] below which that of an image of coarse pixels is not known.
+_NARROW = 2.5
+#: Coarse pixels over wavelength times focal ratio.
+_COARSE = 0.75
 #: Decades below the brightest pixel that the plot shows.
 _DECADES = 4.0
 #: Images whose cuts are drawn.
@@ -109,11 +117,19 @@ class DiffractionPsf(FieldResult):
         return np.sqrt(mean - (self.centroid**2).sum(axis=1))
 
     @property
+    def undersampled(self) -> np.ndarray:
+        """Whether pixels are larger than half of wavelength times focal ratio, shape [n_field] bool."""
+        return self.pixel > self.airy_radius / 2.44
+
+    @property
     def fwhm(self) -> np.ndarray:
-        """Diameter of a disc with the area above half the peak of each image [m], shape [n_field]."""
-        finer = zoom(self.image, (1, _FINER, _FINER), order=3, mode="nearest", grid_mode=True)
-        above = (finer > 0.5 * finer.max(axis=(1, 2), keepdims=True)).sum(axis=(1, 2))
-        return 2.0 * self.pixel / _FINER * np.sqrt(above / np.pi)
+        """Diameter of a disc with the area above half the peak of each image [m], shape [n_field].
+
+        NaN of an image narrower than two and a half pixels of more than three quarters of wavelength times focal ratio.
+        """
+        width = np.array([_width(image) for image in self.image])
+        coarse = self.pixel > _COARSE * self.airy_radius / 1.22
+        return self.pixel * np.where(coarse & (width < _NARROW), np.nan, width)
 
     def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
@@ -146,8 +162,8 @@ class DiffractionPsf(FieldResult):
             above, below = parts
             panels = drawing.panels_of(above, len(self.fields), rows, columns)
             image: Any = None
-            for i, axes in enumerate(panels):
-                image = _draw_image(axes, self, i)
+            for i, (axes, fwhm) in enumerate(zip(panels, self.fwhm, strict=True)):
+                image = _draw_image(axes, self, i, float(fwhm))
             half = 0.5e6 * self.pixel * self.image.shape[-1]
             bar = drawing.round_length(0.6 * half)
             drawing.draw_scale_bar(panels[0], bar, self.size_text(bar * 1e-6, float(self.plate_scale[0])))
@@ -167,7 +183,24 @@ def pixel_axis(pixel: float, pixels: int) -> np.ndarray:
     return (np.arange(pixels) - pixels // 2) * pixel
 
 
-def _draw_image(axes: Axes, psf: DiffractionPsf, i: int) -> AxesImage:
+def _width(image: np.ndarray) -> float:
+    """Return the diameter of a disc with the area above half the peak of an image [pixel]."""
+    bright = image > _BRIGHT * image.max()
+    bright_image = image[_range_of(bright.any(axis=1)), _range_of(bright.any(axis=0))]
+    factor = max(1, -(-_SAMPLES // max(bright_image.shape)))
+    finer = zoom(bright_image, factor, order=5, mode="mirror")
+    # The first and the last samples are pixel centres.
+    area = (bright_image.shape[0] - 1) / (finer.shape[0] - 1) * (bright_image.shape[1] - 1) / (finer.shape[1] - 1)
+    return float(2.0 * np.sqrt((finer > 0.5 * finer.max()).sum() * area / np.pi))
+
+
+def _range_of(bright: np.ndarray) -> slice:
+    """Return the rows or columns from the first to the last bright one, with the pixels beyond."""
+    places = np.flatnonzero(bright)
+    return slice(max(int(places[0]) - _RIM, 0), int(places[-1]) + _RIM + 1)
+
+
+def _draw_image(axes: Axes, psf: DiffractionPsf, i: int, fwhm: float) -> AxesImage:
     from matplotlib.colors import LogNorm
 
     image = psf.image[i] / psf.image[i].max()
@@ -181,10 +214,10 @@ def _draw_image(axes: Axes, psf: DiffractionPsf, i: int) -> AxesImage:
     drawing.draw_circle(axes, psf.airy_radius[i] * 1e6, color="white", style=(0, (3, 2)))
     axes.set(xticks=[], yticks=[])
     axes.set_title(psf.field_labels()[i], fontsize=9.5)
-    fwhm = psf.fwhm[i]
     lit = "" if psf.lit_fraction[i] > 0.995 else f"lit {100 * psf.lit_fraction[i]:.1f} % of the pupil"
+    width = psf.size_text(fwhm, float(psf.plate_scale[i])) if np.isfinite(fwhm) else "within some pixels"
     axes.set_xlabel(
-        f"Strehl {psf.strehl[i]:.3g}\nFWHM {psf.size_text(fwhm, float(psf.plate_scale[i]))}\n{lit}",
+        f"Strehl {psf.strehl[i]:.3g}\nFWHM {width}\n{lit}",
         fontsize=7.5,
     )
     return shown

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -186,8 +186,44 @@ def encircled_energy(
     request = Request.of(telescope, fields, wavelengths, threads=threads).on(focal_plane)
     if kind == "geometric":
         return _of_spots(spots(request, sampling="spiral", n_pupil=n_pupil, reference=reference), circle_radii)
-    images = fft_psf(request, pixels=_PIXELS, n_pupil=n_pupil, reference=reference, progress=progress)
-    return _of_images(images, circle_radii)
+    return diffracted_energy(
+        request, circle_radii, n_pupil=n_pupil, reference=reference, progress=progress, pixels=_PIXELS
+    )
+
+
+def diffracted_energy(
+    request: Request,
+    radii: np.ndarray | None = None,
+    *,
+    pixels: int,
+    n_pupil: int | None = None,
+    reference: SpotReference = "centroid",
+    progress: Callable[[int], None] | None = None,
+) -> EncircledEnergy:
+    """Return the encircled energy of diffraction images of so many pixels a side, which are those of each field.
+
+    All images have the pixels of the largest spots. Where these are too coarse for another field, the light near its
+    middle is that of an image of this field alone.
+    """
+    psf = fft_psf(request, pixels=pixels, n_pupil=n_pupil, reference=reference, progress=progress)
+    energy = _of_images(psf, radii)
+    finer = {}
+    for i in np.flatnonzero(psf.undersampled):
+        alone = fft_psf(request.at_fields(slice(i, i + 1)), pixels=pixels, n_pupil=n_pupil, reference=reference)
+        if alone.pixel < psf.pixel:
+            finer[i] = alone
+    if radii is None:
+        edges = {float(alone.axis[-1]) for alone in finer.values()} | {float(psf.axis[-1])}
+        energy = _of_images(psf, np.unique(np.concatenate([np.linspace(0.0, edge, _RADII) for edge in edges])))
+    radius, fraction = energy.radius, energy.fraction.copy()
+    for i, alone in finer.items():
+        edge = float(alone.axis[-1])
+        (near, at_edge), (_, coarse_at_edge) = (
+            (_light_within(image, radius / pixel), _light_within(image, np.array([edge / pixel]))[0])
+            for image, pixel in ((alone.image[0], alone.pixel), (psf.image[i], psf.pixel))
+        )
+        fraction[i] = np.where(radius <= edge, near, at_edge + np.maximum(fraction[i] - coarse_at_edge, 0.0))
+    return replace(energy, fraction=fraction)
 
 
 def _of_images(psf: DiffractionPsf, radii: np.ndarray | None = None) -> EncircledEnergy:

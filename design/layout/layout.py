@@ -43,6 +43,10 @@ _STOP = "#000000"
 _STOP_BAR = 0.1
 #: Lenses and detector have a panel of their own below this fraction of the whole size.
 _SMALL = 0.4
+#: Letters of a name that there is room for above a drawing.
+_SHORT_NAME = 14
+#: Height of a picture for each more [inch].
+_NAME_HEIGHT = 0.06
 
 
 @dataclass(frozen=True)
@@ -133,8 +137,11 @@ class Layout(Result):
         lens_box = drawing.box([n for n in names if n in within]) if within & set(names) else full_box
         zoom = bool(self.lenses) and bool(np.ptp(lens_box, axis=0).max() < _SMALL * np.ptp(full_box, axis=0).max())
         with styled():
+            longest = max((len(name) for name in names), default=0)
             if zoom:
-                figure = figure_at(ax, 12.4, 5.4 if drawing.lying else 6.4)
+                # Names above the drawing take more room where they are long.
+                height = 5.4 + _NAME_HEIGHT * max(longest - _SHORT_NAME, 0)
+                figure = figure_at(ax, 12.4, height if drawing.lying else 6.4)
                 full_axes, lens_axes = figure.subplots(1, 2)
                 _draw(lens_axes, drawing, lens_box, within & set(names), beams=False)
                 outside = [n for n in names if n not in within]
@@ -259,6 +266,13 @@ class _Drawing:
         y, z = points[..., 1], points[..., 2]
         return np.stack([-z, y] if self.lying else [y, z], axis=-1)
 
+    def names_above(self, names: set[str]) -> bool:
+        """Tell whether surfaces follow each other from left to right: then their names stand in a row above."""
+        profiles = [self(self.layout.profiles[name]) for name in names]
+        lit = [points[np.isfinite(points).all(axis=1)] for points in profiles]
+        spread = np.ptp([points.mean(axis=0) for points in lit if len(points)] or np.zeros((1, 2)), axis=0)
+        return bool(spread[0] > spread[1]) if spread.any() else self.lying
+
     def box(self, names: list[str]) -> np.ndarray:
         """Return the lowest and the highest corner of some surfaces, shape [2, 2]."""
         points = np.concatenate([self(self.layout.profiles[name]) for name in names])
@@ -323,15 +337,15 @@ def _draw(axes: Axes, drawing: _Drawing, box: np.ndarray, named: set[str], *, be
     axes.set_ylabel(f"y [{unit}]" if drawing.lying else f"z, towards the sky [{unit}]")
     axes.grid(True, color="0.94", linewidth=0.6)
     axes.set_axisbelow(True)
-    labels = _labels(drawing, named, scale, (low, high))
+    above = drawing.names_above(named)
+    labels = _labels(drawing, named, scale, (low, high), above)
     if stop is not None:
-        side = 1 if drawing.lying else 0
-        labels.append(("stop", max((bar[1] for bar in bars), key=lambda point: float(point[side]))))
-    _write_names(axes, labels, drawing.lying)
+        labels.append(("stop", max((bar[1] for bar in bars), key=lambda point: float(point[int(above)]))))
+    _write_names(axes, labels, above)
 
 
 def _labels(
-    drawing: _Drawing, named: set[str], scale: float, limits: tuple[np.ndarray, np.ndarray]
+    drawing: _Drawing, named: set[str], scale: float, limits: tuple[np.ndarray, np.ndarray], above: bool
 ) -> list[tuple[str, np.ndarray]]:
     """Return names with the rims of their surfaces; the surfaces of a lens have one name."""
     layout = drawing.layout
@@ -352,7 +366,7 @@ def _labels(
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             continue
-        side = 1 if drawing.lying else 0
+        side = int(above)
         rim = points[points[:, side] >= points[:, side].max() - 1e-6 * scale]
         place = rim.mean(axis=0)
         if (place >= limits[0]).all() and (place <= limits[1]).all():
@@ -360,25 +374,25 @@ def _labels(
     return labels
 
 
-def _write_names(axes: Axes, labels: list[tuple[str, np.ndarray]], lying: bool) -> None:
-    """Write names in a column at the right or a row above, far enough apart, with lines to the surfaces."""
+def _write_names(axes: Axes, labels: list[tuple[str, np.ndarray]], above: bool) -> None:
+    """Write names in a row above or a column at the right, far enough apart, with lines to the surfaces."""
     if not labels:
         return
-    side = 0 if lying else 1
-    low, high = axes.get_xlim() if lying else axes.get_ylim()
-    step = (high - low) / (30.0 if not lying else 34.0)
+    side = 0 if above else 1
+    low, high = axes.get_xlim() if above else axes.get_ylim()
+    step = (high - low) / (30.0 if not above else 34.0)
     labels = sorted(labels, key=lambda item: float(item[1][side]))
     places = _apart(np.array([item[1][side] for item in labels]), step, low + step, high - step)
-    edge = axes.get_ylim()[1] if lying else axes.get_xlim()[1]
+    edge = axes.get_ylim()[1] if above else axes.get_xlim()[1]
     for (name, rim), place in zip(labels, places, strict=True):
-        end: Any = (place, edge) if lying else (edge, place)
+        end: Any = (place, edge) if above else (edge, place)
         axes.annotate(
             plain_text(name),
             xy=(rim[0], rim[1]),
             xytext=end,
-            rotation=60 if lying else 0,
+            rotation=60 if above else 0,
             ha="left",
-            va="bottom" if lying else "center",
+            va="bottom" if above else "center",
             fontsize=7.5,
             annotation_clip=False,
             arrowprops={"arrowstyle": "-", "color": "0.55", "linewidth": 0.5, "shrinkA": 1.0, "shrinkB": 0.0},

@@ -37,6 +37,13 @@ FittedPupil = Literal["full", "lit"]
 ZernikeOrdering = Literal["noll", "fringe"]
 #: Maps of single terms in one plot.
 _MAPS = 8
+#: Terms by which it is found whether the wavefront of the whole annulus is one of Zernikes.
+_SMOOTH_TERMS = 28
+#: Lit part of the annulus from which on it is.
+_MOSTLY_LIT = 0.95
+#: Largest rms residual of these terms over the wavelength, that of a diffraction-limited image. Aspheres bend rays far
+#: outside their apertures by many waves: 34 are left at 0.64 degrees of HSC, two thirds lit; 0.014 at 1.83 of the LSST.
+_SMOOTH_RESIDUAL = 1.0 / 14.0
 
 
 @dataclass(frozen=True)
@@ -261,6 +268,25 @@ def wavefront_zernikes(
     return FieldZernikes(request, coefficients, residual, telescope.pupil_obscuration, pupil, ordering)
 
 
+def pupil_to_fit(request: Request) -> FittedPupil:
+    """Return "full", or "lit" where the rays that apertures stop at a field of a request have no smooth wavefront."""
+    count = min(_SMOOTH_TERMS, len(request.pupil))
+    x, y = request.unit_pupil.T
+    terms = annular_zernikes(count, x, y, request.telescope.pupil_obscuration).T
+    weights = request.pupil.weights
+    for _, batch in request.parts():
+        value, lit = _wavefronts(batch)
+        stopped = lit @ weights < _MOSTLY_LIT * weights.sum()
+        if not np.isfinite(value).all():
+            return "lit"
+        if stopped.any():
+            used = np.ones_like(lit[stopped])
+            _, residual = _fit(terms, value[stopped], used, weights, batch.fields[stopped], "full")
+            if residual.max() > _SMOOTH_RESIDUAL * request.wavelength:
+                return "lit"
+    return "full"
+
+
 def _wavefronts(request: Request) -> tuple[np.ndarray, np.ndarray]:
     """Return the OPD [m] of the pupil points of a request, and which are lit, [n_field, n_pupil] each."""
     telescope, w = request.telescope, request.wavelength
@@ -348,7 +374,7 @@ def _fit(
     if short.any():
         field_name = field_label(fields[short][0])
         if pupil == "full":
-            raise DomainError(f"{field_name}: rays of the annulus miss the detector; pupil='lit' leaves them out")
+            raise DomainError(f"{field_name}: rays of the annulus miss the detector; pupil = lit leaves them out")
         raise DomainError(f"{field_name}: {int(used[short][0].sum())} pupil points are lit; expected at least {jmax}")
     coefficients = np.empty((len(value), jmax))
     complete = used.all(axis=1)

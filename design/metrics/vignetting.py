@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 _RINGS = 14
 #: Spokes of field points where none are given.
 _SPOKES = 24
+#: Largest lower end of the plots [%], so that the scatter of a telescope without vignetting is no structure.
+_LEAST = 95.0
 
 
 @dataclass(frozen=True)
@@ -173,7 +175,7 @@ def _draw_profile(axes: Axes, result: Vignetting) -> None:
     finish_axes(
         axes,
         xlim=(0.0, None),
-        ylim=(None, max(101.0, float(percent.max()) + 1.0)),
+        ylim=(min(_LEAST, float(percent.min())) - 1.0, max(100.0, float(percent.max())) + 1.0),
         xlabel=label,
         ylabel="light relative to the axis [%]",
     )
@@ -182,6 +184,8 @@ def _draw_profile(axes: Axes, result: Vignetting) -> None:
 
 def _draw_map(axes: Axes, result: Vignetting) -> None:
     places, name, unit = result.field_places()
-    image = draw_field_map(axes, places, 100.0 * result.relative, cmap="viridis")
+    percent = 100.0 * result.relative
+    lowest, highest = min(_LEAST, float(percent.min())), max(100.0, float(percent.max()))
+    image = draw_field_map(axes, places, percent, cmap="viridis", vmin=lowest, vmax=highest)
     axes.set(xlabel=f"{name} x [{unit}]", ylabel=f"{name} y [{unit}]")
     figure_of(axes).colorbar(image, ax=axes, fraction=0.046, pad=0.02).set_label("light relative to the axis [%]")

@@ -11,7 +11,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...models.first_order import first_order, footprints
 from ...models.paraxial import with_moved_pupil
-from ...models.shapes.shape import Rotational
+from ...models.shapes.shape import Plane, Rotational
 from ...models.surface import Interaction
 from ...models.telescope import Telescope
 from ...models.thickness import front_surface, light_axis, thickness
@@ -53,7 +53,7 @@ class EdgeThickness(GoalOperand):
     radius : float, optional
         Distance from the axis [m]; by default the larger clear radius of the two surfaces, which is that of the
         aperture or, without one, of the paraxial light of the whole field; of a plane without either, that of the
-        other surface.
+        other surface, and of two such planes the axis.
     value, minimum, maximum, weight : float
         As in :class:`~.operand.GoalOperand` [m].
     """
@@ -68,11 +68,13 @@ class EdgeThickness(GoalOperand):
             # A plane without aperture, such as that of a stop, has no edge of its own.
             radii = [clear_radius(telescope, surface.name) for surface in pair]
             radius = max((radius for radius in radii if np.isfinite(radius)), default=np.inf)
+            if np.isinf(radius) and all(isinstance(surface.shape, Plane) for surface in pair):
+                radius = 0.0
         else:
             radius = self.radius
         ends = []
         for surface in pair:
-            sag = float(surface.shape.sag(0.0, radius))
+            sag = float(surface.shape.sag(0.0, radius)) if np.isfinite(radius) else np.nan
             if not np.isfinite(sag):
                 raise DomainError(f"operand {self.label}: {surface.name} has no edge at {radius:.6g} m from its axis")
             ends.append(surface.to_telescope([0.0, radius, sag]))

@@ -169,6 +169,7 @@ def shim(
     reporter = Reporter(quiet=True) if reporter is None else reporter
     plane, names = experiment.focal_plane, experiment.config.ccds or ()
     fit, check = (Places.gauss(plane, names, order) for order in (_FIT[merit], _CHECK))
+    named_parts = _parts_with_places(plane, fit, parts)
     heights = fit.heights(plane)
     with reporter.stage("widths and ellipticities against height"):
         curves = focus_curves(experiment, fit, float(np.abs(heights).max()) + _ROOM, threads)
@@ -184,7 +185,6 @@ def shim(
         (focus,) = _best_motions(curves, fit, heights, whole_plane, merit, pairs)
         (level,) = _best_motions(curves, fit, np.zeros_like(heights), whole_plane, merit, pairs)
         focused = heights + _height_change(focus, fit.position)
-        named_parts = _parts_with_places(plane, fit, parts)
         best = _best_motions(curves, fit, focused, [(center, rows) for _, center, rows in named_parts], merit, pairs)
     motions = {name: motion for (name, *_), motion in zip(named_parts, best, strict=True)}
     shimmed = focused.copy()
@@ -262,7 +262,7 @@ def _parts_with_places(
     raft = camera.raft_index[places.ccd]
     if (raft < 0).any():
         name = camera.ccd_names[places.ccd[raft < 0][0]]
-        raise ConfigError(f"parts = rafts: expected ccds, as {name} of {camera.name} is on no raft")
+        raise ConfigError(f"parts = rafts: expected ccds, as {name} of {camera.name} is on no raft", key="parts")
     centers = {i: camera.centers[camera.raft_index == i].mean(axis=0) for i in np.unique(raft)}
     return [(camera.raft_names[i], center, np.flatnonzero(raft == i)) for i, center in centers.items()]
 
@@ -378,12 +378,14 @@ def _state_metrics(
 
 
 def draw_shims(ax: Axes | Figure | None, planes: Mapping[str, FocalPlane]) -> Figure:
-    """Draw focal planes of one camera by name, on the scale of the first."""
+    """Draw focal planes of one camera by name, on one scale."""
     first = next(iter(planes.values()))
     camera = first.camera
     edge = 1.04e3 * camera.reach
     limits = (-edge, edge, -edge, edge)
-    bounds = 3e6 * float(np.std(first.height(*camera.centers.T))) or 1.0
+    # The focus of the whole, too: beside it the heights of a flat focal plane are rounding.
+    heights = np.array([1e6 * plane.height(*camera.centers.T) for plane in planes.values()])
+    bounds = float((np.abs(heights.mean(axis=1)) + 3.0 * heights.std(axis=1)).max()) or 1.0
     with styled():
         figure = figure_at(ax, 13.0, 4.6)
         panels = figure.subplots(1, len(planes))

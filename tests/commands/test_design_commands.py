@@ -160,6 +160,20 @@ def test_maps_and_double_zernikes(capsys, in_folder):
     assert (in_folder / "double_zernikes_paul_baker.png").exists()
 
 
+def test_zernikes_of_strongly_vignetted_fields_are_those_of_the_light(capsys, in_folder):
+    # At 0.64 degrees HSC lights two thirds of the annulus; at 0.75 rays of the others miss the detector.
+    assert main(["zernikes", "hsc", "--jmax", "11", "--json"]) == 0
+    by_default = json.loads(capsys.readouterr().out)
+    assert main(["zernikes", "hsc", "--jmax", "11", "--pupil", "lit", "--json"]) == 0
+    assert by_default == json.loads(capsys.readouterr().out)
+    assert np.abs(by_default["zernike_nm"]).max() < 1500.0
+    # The LSST lights 70 % of it at the rim of its wavefront sensors, where stopped rays have a smooth wavefront.
+    assert main(["zernikes", "lsst_v3.3_r", "--field-deg", "1.83", "--jmax", "11", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["pupil"] == "full"
+    assert main(["zernikes", "hsc", "--pupil", "full"]) == 2
+    assert "pupil = lit" in capsys.readouterr().err
+
+
 @pytest.mark.long
 def test_images_go_to_fits_and_the_two_ways_agree(capsys, in_folder):
     common = ["--field-deg", "0.4", "--pixels", "32", "--pixel-um", "0.4", "--json"]

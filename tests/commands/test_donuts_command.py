@@ -221,6 +221,19 @@ def test_a_simulated_file_names_a_telescope_of_any_path(tmp_path):
         assert read_stamps(path).header.model == name
 
 
+@pytest.mark.long
+def test_a_simulated_file_is_read_from_any_folder(tmp_path, monkeypatch):
+    """Its telescope was named as from the folder where it was made."""
+    for name in ("telescopes", "nights", "elsewhere"):
+        (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "ritchey-chretien", "telescopes/rc.yaml", "--diameter-mm", "1000", "--f-number", "8"]) == 0
+    simulate = ["donuts", "nights/try.fits", "--simulate", "-t", "telescopes/rc.yaml", "--defocus-um", "4000"]
+    assert main([*simulate, "--set", "stars=1", "--quiet"]) == 0
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert main(["donuts", "../nights/try.fits", "--no-diffraction", "--no-orientation-check", "--quiet"]) == 0
+
+
 @pytest.mark.slow
 def test_a_simulated_file_is_one_that_the_command_reads(tmp_path, monkeypatch, capsys):
     """A decentred M2 under a moved camera: file and fit know what moved, and the file has the truth."""

@@ -46,6 +46,14 @@ def test_tables(tmp_path, capsys):
     assert str(table["M2.rx"].unit) == "m / rad"
 
 
+def test_a_parameter_without_effect_has_no_largest_terms(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["sensitivity", "auxtel", "--parameters", "M3.dx,M2.dz", "--no-picture"]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert next(row for row in rows if row[:1] == ["M3.dx"])[1:3] == ["-", "0"]
+    assert next(row for row in rows if row[:1] == ["M2.dz"])[1] == "Z4,"
+
+
 @pytest.mark.usefixtures("empty_pictures")
 def test_optimize_writes_a_prescription(tmp_path, capsys):
     command = ["optimize", "paul_baker", "--variables", "M2.conic,Detector.dz", "--merit", "wavefront"]

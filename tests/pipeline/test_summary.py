@@ -1,12 +1,12 @@
 """Metrics of a run: the ranges of separation of its mean correlations."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from pachon.measure.correlation import Correlation, shear_correlation
-from pachon.pipeline.summary import bins_up_to, run_metrics, scatter, size_scatter
+from pachon.pipeline.summary import bins_up_to, ccd_metrics, run_metrics, scatter, size_scatter
 from pachon.reconstruction.ccd_product import read_product
 
 ARCMIN = np.deg2rad(1 / 60)
@@ -26,6 +26,17 @@ def test_long_separations_are_those_from_10_to_180_arcmin(finished_run):
     assert metrics["xi_plus_truth_short"] == pytest.approx((4.0 + 3 * 8.0) / 4)
     assert metrics["xi_plus_truth_long"] == pytest.approx(1.5)
     assert np.isnan(metrics["error_xi_plus_truth_long"])
+
+
+def test_the_field_of_a_ccd_is_that_of_its_middle_wherever_its_stars_are(finished_run):
+    product = read_product(finished_run / "ccd_R22_S11.fits")
+    right = product.holdout.x > np.median(product.holdout.x)
+    half = {f.name: getattr(product.holdout, f.name) for f in fields(product.holdout)}
+    half = {name: values if values is None else values[right] for name, values in half.items()}
+    # The middle of R22_S11 lies on the axis.
+    assert ccd_metrics(product)["field_deg"] == pytest.approx(0.0, abs=2e-4)
+    metrics = ccd_metrics(replace(product, holdout=type(product.holdout)(**half)))
+    assert metrics["field_deg"] == pytest.approx(0.0, abs=2e-4)
 
 
 def test_one_measured_psf_of_a_ccd_has_no_scatter(finished_run):

@@ -526,7 +526,14 @@ def test_tables_summaries_and_pictures(behind_focus, clean):
     text = json.loads(json.dumps(fit.summary(), allow_nan=False))
     assert text["zernike_nm"][1] == [None] * 8
     np.testing.assert_allclose(fit.residuals[0], fit.images[0] - fit.model[0])
-    assert len(fit.plot().axes) >= 7
+    figure = fit.plot()
+    assert len(figure.axes) >= 7
+    # The legend hides no bar, and what was not fitted of a large stamp is cut off.
+    figure.canvas.draw()
+    (bars,) = (axes for axes in figure.axes if axes.get_legend())
+    assert bars.get_legend().get_window_extent().y0 >= bars.get_window_extent().y1
+    columns = np.flatnonzero(np.isfinite(fit.model[0]).any(axis=0))
+    assert figure.axes[0].get_xlim() == (columns[0] - 8, columns[-1] + 8)
 
 
 @pytest.mark.long

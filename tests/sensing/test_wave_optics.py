@@ -8,6 +8,8 @@ from scipy import fft
 from scipy.ndimage import map_coordinates
 
 import pachon
+from pachon.core.errors import ConfigError
+from pachon.models.zernike_polynomials import annular_zernikes
 from pachon.pipeline.simulate import donut_file
 from pachon.pipeline.simulate.donut_file import DonutScene, simulate_donuts
 from pachon.raytrace.rays import RayStatus
@@ -168,3 +170,28 @@ def test_stamps_hold_the_light_not_rays_that_are_stopped():
     fields = np.deg2rad([(0.58, 0.01), (-0.41, -0.35), (0.0, 0.7)])
     model = pachon.DonutModel(air=pachon.DonutAir(fwhm=0.8 * np.pi / 648000))
     assert donut_file._stamp_size(hsc, fields, model) == 181
+
+
+@pytest.mark.long
+def test_zernikes_of_simulated_donuts_are_those_of_the_light():
+    """At 0.54 degrees the apertures of HSC stop 29 % of the rays, which aspheres would bend far beyond the light."""
+    hsc = pachon.load_telescope("hsc")
+    moved, field = hsc.perturbed("HSC", shift=(200e-6, 0.0, 0.0)), np.deg2rad([-0.4087, -0.3526])
+    model = pachon.DonutModel(
+        air=pachon.DonutAir(fwhm=0.8 * np.pi / 648000), detector=pachon.DonutDetector(defocus=1e-3)
+    )
+    donuts = simulate_donuts(hsc, moved, DonutScene(stars=1), model, field)
+    before, after = (pachon.wavefront_opd(t, field, hsc.default_wavelength, grid=96) for t in (hsc, moved))
+    lit = before.lit & after.lit
+    points = np.stack([before.x, before.y])[:, lit] / (0.5 * hsc.pupil_diameter)
+    terms = annular_zernikes(22, *points, hsc.pupil_obscuration).T
+    left = (after.value - before.value)[lit] - terms[:, 3:] @ donuts.zernikes[0]
+    left -= terms[:, :3] @ np.linalg.lstsq(terms[:, :3], left, rcond=None)[0]
+    # Of a change of 120 nm; terms beyond Z22 leave the rest.
+    assert np.std(left) < 1.5e-9
+
+
+def test_corner_sensors_are_those_of_the_lsst_alone():
+    hsc = pachon.load_telescope("hsc")
+    with pytest.raises(ConfigError, match="layout = corners: hsc has the camera hsc; expected the LSST's, or random"):
+        simulate_donuts(hsc, hsc, DonutScene(layout="corners"), pachon.DonutModel(detector=pachon.DonutDetector(1e-3)))

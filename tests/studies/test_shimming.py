@@ -18,7 +18,7 @@ from pachon.pipeline.simulate.ccd_exposure import expose_positions
 from pachon.studies.shimming.curves import E, G, Places, T, focus_curves, measured
 from pachon.studies.shimming.pairs import PairSum, separation_edges
 from pachon.studies.shimming.product import shim_metrics
-from pachon.studies.shimming.shim import STATES, Motion, moved_parts, shim, shimmed_configuration
+from pachon.studies.shimming.shim import STATES, Motion, draw_shims, moved_parts, shim, shimmed_configuration
 from pachon.wavefront.chief_rays import fields_at
 
 # Three CCDs that are not in a row hold a raft.
@@ -225,6 +225,26 @@ def test_bad_arguments_are_one_line(capsys):
         shim(experiment_of(psf__engine="fast"))
     assert main(["shim", "--heights", "nowhere"]) == 2
     assert "focal_plane.heights = nowhere: expected lsstcam" in capsys.readouterr().err
+
+
+def test_a_flat_focal_plane_in_focus_does_not_saturate_the_plot():
+    flat = FocalPlane.flat("decam")
+    focused = moved_parts(flat, {name: Motion(dz=17e-6) for name in flat.names})
+    figure = draw_shims(None, {"focused as a whole": focused, "motions of ccds": flat.with_moved("S5", dz=-1e-6)})
+    lowest, highest = figure.axes[0].images[-1].get_clim()
+    assert lowest == -highest
+    assert 17.0 <= highest < 25.0
+
+
+def test_ccds_without_rafts_are_refused_before_the_images_are_made(monkeypatch, tmp_path, capsys):
+    """HSC's, whose curves of focus take half a minute for four CCDs."""
+    monkeypatch.setattr("pachon.studies.shimming.shim.focus_curves", lambda *_: pytest.fail("curves were computed"))
+    assert main(["shim", "--set", "telescope=hsc", "--ccds", "hsc049", "-o", str(tmp_path / "out")]) == 2
+    assert (
+        capsys.readouterr()
+        .err.splitlines()[-1]
+        .endswith("--parts = rafts: expected ccds, as hsc049 of hsc is on no raft")
+    )
 
 
 @pytest.mark.long

@@ -1,6 +1,7 @@
 """The OPD against Zemax, and against the rays that it belongs to."""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from astropy.io import fits
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError
+from pachon.wavefront.zernike import fit_zernikes
 
 ZEMAX = Path(__file__).parents[1] / "data" / "zemax"
 
@@ -238,3 +240,18 @@ def test_points_that_are_no_grid_have_no_pixel_scale(lsst_r, tmp_path):
     with fits.open(tmp_path / "a.fits") as hdus:
         assert "PIXELSCL" not in hdus["VALUE"].header
         assert hdus["VALUE"].header["WAVELEN"] == 620e-9
+
+
+@pytest.mark.long
+def test_ticks_of_the_bars_of_zernikes_do_not_overlap():
+    """On the axis of HSC the largest term is 86 nm; the linear part of the scale reached to 0.86 nm, beyond a tick."""
+    hsc = pachon.load_telescope("hsc")
+    opd = pachon.wavefront_opd(hsc, (0.0, 0.0), grid=64)
+    figure = opd.plot(fit_zernikes(opd, 0.5 * hsc.pupil_diameter, hsc.pupil_obscuration, 28))
+    figure.canvas.draw()
+    bars = next(axes for axes in figure.axes if axes.get_yscale() == "symlog")
+    low, high = bars.get_window_extent().intervaly
+    boxes = sorted((label.get_window_extent() for label in bars.get_yticklabels()), key=lambda box: box.y0)
+    boxes = [box for box in boxes if low < 0.5 * (box.y0 + box.y1) < high]
+    assert len(boxes) > 3
+    assert all(lower.y1 < upper.y0 for lower, upper in pairwise(boxes))

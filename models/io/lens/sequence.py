@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ....core.errors import PrescriptionError, error_context
-from ...aperture import Complement
 from ...design_data import DesignData
 from ...media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
 from ...media.medium import ConstantIndex, Medium
@@ -27,6 +26,7 @@ from ...telescope import VACUUM, Telescope
 from ..glass_catalogue import CATALOGUES, GlassCatalogue
 from ..glass_search import find_glass, maker_of, makers_in
 from ..writable import report_obscuration, report_pupil_plane, report_unheld, require_met, require_sequential
+from .apertures import report_aperture
 from .description import PUPIL_PLANE, LensSurface
 from .frame import HALF_TURN, rotated_aperture, rotated_shape
 from .source import Findings, Source
@@ -168,9 +168,8 @@ class LensSequence:
 
     def leave_out_aperture(self, surface: LensSurface, expected: str) -> None:
         """Raise the error of a surface whose clear aperture the file cannot hold; if lenient, warn."""
-        region = surface.aperture.part if isinstance(surface.aperture, Complement) else surface.aperture
-        kind = f"obscuring {type(region).__name__}" if region is not surface.aperture else type(region).__name__
-        self.leave_out(f"surface {surface.name}: aperture {kind}: {self.file} has {expected}", "left out")
+        assert surface.aperture is not None
+        report_aperture(surface.name, surface.aperture, self.file, expected, self.findings)
 
     def stated_aperture(self, kinds: Collection[str]) -> tuple[str, float]:
         """Return the aperture, of one of some kinds; if lenient the diameter of the entrance pupil [m] for another."""

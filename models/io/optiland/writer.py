@@ -20,6 +20,7 @@ from ...paraxial import stop_states_rays, with_true_aperture
 from ...rotation import rotation_angles
 from ...surface import Interaction
 from ...telescope import Telescope
+from ..lens.apertures import report_aperture
 from ..lens.description import LensSurface
 from ..lens.sequence import lens_surfaces, stated_wavelengths
 from ..lens.source import Findings
@@ -31,6 +32,8 @@ from .reader import APERTURES, FIELD_TYPES, THIN_LENS_MODEL
 from .shapes import geometry_items
 
 MM = 1e-3
+#: What surfaces of optiland have, as messages say.
+_HELD_APERTURES = "discs, rings, obscuring discs, ellipses and rectangles along x"
 #: Keys of the aperture by that of the design data; a working focal ratio has none.
 _APERTURES = {kind: key for key, kind in APERTURES.items()}
 
@@ -38,8 +41,8 @@ _APERTURES = {kind: key for key, kind in APERTURES.items()}
 def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str:
     """Return the text of a file of optiland.
 
-    PrescriptionError, with surface and part, if a part of the telescope has no counterpart in optiland; pickups and
-    solves have none, and are left out with a warning where `lenient`.
+    PrescriptionError, with surface and part, if a part of the telescope has no counterpart in optiland; pickups, solves
+    and apertures without one are left out with a warning where `lenient`.
     """
     t, findings = with_optiland_aperture(with_true_aperture(telescope)), Findings(lenient)
     with error_context(subject=t.name):
@@ -62,7 +65,12 @@ def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str
         ]
         for surface in lens_surfaces(t, stop):
             with error_context(subject=f"surface {surface.name}"):
-                surfaces.append(_surface_items(surface, first))
+                items = _surface_items(surface, first)
+            if surface.aperture is not None:
+                items["aperture"] = _aperture_items(surface.aperture)
+                if items["aperture"] is None:
+                    report_aperture(surface.name, surface.aperture, "a file of optiland", _HELD_APERTURES, findings)
+            surfaces.append(items)
         report_obscuration(t, findings, "a file of optiland")
     heights = [s["geometry"]["cs"]["z"] for s in surfaces]
     for items, height, next_height in zip(surfaces[1:], heights[1:], [*heights[2:], heights[-1]], strict=True):
@@ -97,7 +105,7 @@ def _in_millimetres(system: dict[str, Any]) -> None:
 
 def _surface_items(surface: LensSurface, first: float) -> dict[str, Any]:
     x, y, z = map(float, surface.position)
-    region, grating = surface.aperture, surface.grating
+    grating = surface.grating
     geometry = geometry_items(surface.shape, MM) if grating is None else grating_items(grating, surface.shape, MM)
     return {
         "type": "Surface",
@@ -105,7 +113,7 @@ def _surface_items(surface: LensSurface, first: float) -> dict[str, Any]:
         "geometry": {**geometry, "cs": _system(z - first, x, y, surface.axes)},
         "material_post": material_items(surface.after),
         "is_stop": surface.stop,
-        "aperture": None if region is None else _aperture_items(region),
+        "aperture": None,
         "comment": surface.name,
         "interaction_model": {
             **_model(surface),
@@ -123,7 +131,8 @@ def _model(surface: LensSurface) -> dict[str, Any]:
     return {"type": "RefractiveReflectiveModel" if surface.grating is None else MODEL}
 
 
-def _aperture_items(aperture: Aperture) -> dict[str, Any]:
+def _aperture_items(aperture: Aperture) -> dict[str, Any] | None:
+    """Return the entries of a clear region, or None where optiland has no such aperture."""
     region = aperture.part if isinstance(aperture, Complement) else aperture
     if isinstance(region, Rectangle) and region is aperture and region.angle == 0:
         ends = {
@@ -143,9 +152,7 @@ def _aperture_items(aperture: Aperture) -> dict[str, Any]:
         if region.x or region.y:
             return {"type": "OffsetRadialAperture", **radii, "offset_x": region.x / MM, "offset_y": region.y / MM}
         return {"type": "RadialAperture", **radii}
-    raise PrescriptionError(
-        f"aperture {type(region).__name__}: expected disc, ring, obscuring disc, ellipse, rectangle"
-    )
+    return None
 
 
 def with_optiland_aperture(t: Telescope) -> Telescope:

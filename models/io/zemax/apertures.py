@@ -14,6 +14,9 @@ from ..lens.text import number_text
 from .file import Block
 from .user_apertures import read_user_aperture
 
+#: What surfaces of a Zemax file have, as its messages say.
+HELD_APERTURES = "discs, rings, ellipses and rectangles along x, clear or obscuring, and even spiders"
+
 
 def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | None:
     """Return the clear region of a surface [m], or None where it has none.
@@ -53,8 +56,8 @@ def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | N
     return regions[0] if regions else None
 
 
-def aperture_lines(aperture: Aperture, unit: float) -> list[str]:
-    """Return the lines of a clear region; PrescriptionError where Zemax surfaces have no such aperture."""
+def aperture_lines(aperture: Aperture, unit: float) -> list[str] | None:
+    """Return the lines of a clear region, or None where Zemax surfaces have no such aperture."""
     clear = not isinstance(aperture, Complement)
     region = aperture.part if isinstance(aperture, Complement) else aperture
     if isinstance(region, Circle | Annulus):
@@ -72,9 +75,7 @@ def aperture_lines(aperture: Aperture, unit: float) -> list[str]:
         lines = [f"SPID {number_text(first.width / unit)} {len(region.parts)} 0"]
         region = Circle(1.0, first.x, first.y)
     else:
-        raise PrescriptionError(
-            f"aperture {type(region).__name__}: expected disc, ring, ellipse, rectangle or even spider"
-        )
+        return None
     if region.x or region.y:
         lines.append(f"OBDC {number_text(region.x / unit)} {number_text(region.y / unit)}")
     return lines

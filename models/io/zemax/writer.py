@@ -24,6 +24,7 @@ from ...paraxial import stop_states_rays, with_true_aperture
 from ...surface import Interaction
 from ...telescope import VACUUM, Telescope
 from ..glass_catalogue import NUMBERED, SELLMEIER_TERMS, GlassCatalogue
+from ..lens.apertures import report_aperture
 from ..lens.description import PUPIL_PLANE, LensSurface
 from ..lens.sequence import lens_surfaces, stated_wavelengths
 from ..lens.source import Findings
@@ -36,7 +37,7 @@ from ..writable import (
     require_sequential,
     with_formulas,
 )
-from .apertures import aperture_lines
+from .apertures import HELD_APERTURES, aperture_lines
 from .gratings import grating_lines, with_grooves_along_x
 from .links import add_link_lines
 from .shapes import shape_lines
@@ -54,8 +55,8 @@ CONSTANT_FORMULA = 1
 def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[str, str]:
     """Return the text of a lens file, and that of the glass catalogue that it needs; empty where it needs none.
 
-    PrescriptionError, with surface and part, if a part of the telescope has no counterpart in a Zemax file; pickups and
-    solves without one are left out with a warning where `lenient`.
+    PrescriptionError, with surface and part, if a part of the telescope has no counterpart in a Zemax file; pickups,
+    solves and apertures without one are left out with a warning where `lenient`.
     """
     t, findings = with_true_aperture(require_met(telescope)), Findings(lenient)
     with error_context(subject=t.name):
@@ -100,7 +101,7 @@ def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[
         elif len(blocks) > 1:
             gap = surface.position[2] - surfaces[chains[place - 1]].position[2] if place else surface.distance or 0.0
             blocks[-1].append(f"DISZ {number_text(float(gap) / unit)}")
-        lines_of_surface = _surface_lines(surface, glasses, unit)
+        lines_of_surface = _surface_lines(surface, glasses, unit, findings)
         if surface.stop:
             lines_of_surface.append("STOP")
             if data.aperture == "stop":
@@ -192,7 +193,7 @@ def _break_lines(values: list[float], order: int) -> list[str]:
     ]
 
 
-def _surface_lines(surface: LensSurface, glasses: dict[Medium, str], unit: float) -> list[str]:
+def _surface_lines(surface: LensSurface, glasses: dict[Medium, str], unit: float, findings: Findings) -> list[str]:
     lines = [f"COMM {surface.name}"]
     with error_context(subject=f"surface {surface.name}"):
         if surface.thin_lens is not None:
@@ -204,10 +205,13 @@ def _surface_lines(surface: LensSurface, glasses: dict[Medium, str], unit: float
             lines.append("GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0")
         elif surface.interaction != Interaction.DETECTOR:
             lines += _glass_line(surface.after, glasses)
-        if surface.aperture is not None:
-            lines += aperture_lines(surface.aperture, unit)
-        if surface.semi_diameter:
-            lines.append(f"DIAM {number_text(surface.semi_diameter / unit)} 1")
+    if surface.aperture is not None:
+        aperture = aperture_lines(surface.aperture, unit)
+        if aperture is None:
+            report_aperture(surface.name, surface.aperture, "a Zemax file", HELD_APERTURES, findings)
+        lines += aperture or []
+    if surface.semi_diameter:
+        lines.append(f"DIAM {number_text(surface.semi_diameter / unit)} 1")
     return lines
 
 

@@ -48,3 +48,11 @@ def test_the_sum_is_the_total(lsst_r):
     sums = pachon.seidel_sums(lsst_r).total / np.array([8, 2, 2, 4, 2]) / result.wavelength
     assert result.total[:5] == pytest.approx(sums)
     assert len(result.to_table()) == len(result.names) == 11
+
+
+def test_the_legend_hides_no_bar():
+    triplet = pachon.load_telescope("tests/data/lenses/triplet.zmx")
+    figure = pachon.design.seidel_diagram(triplet).plot()
+    figure.canvas.draw()
+    (axes,) = figure.axes
+    assert axes.get_legend().get_window_extent().y0 >= axes.get_window_extent().y1

@@ -50,6 +50,14 @@ def test_a_perfect_pupil_makes_the_pattern_of_airy(paraboloid, obscuration, meth
     assert psf.airy_radius[0] == pytest.approx(1.22 * 50.0 * WAVE, rel=1e-3)
 
 
+@pytest.mark.parametrize("per_airy", [2.7, 3.3, 5.0, 20.0])
+def test_the_fwhm_does_not_depend_on_the_pixels(paraboloid, per_airy):
+    scale = 50.0 * WAVE
+    psf = fft_psf(paraboloid(f_number=50.0), [[0.0, 0.0]], WAVE, pixel=scale / per_airy, pixels=64)
+    # Of a clear disc 1.02899 wavelengths times the focal ratio; the lattice's rim adds 1e-3.
+    assert psf.fwhm[0] == pytest.approx(1.02899 * scale, rel=2e-3)
+
+
 def test_a_defocused_disc_has_the_strehl_ratio_of_theory(paraboloid):
     # Defocus dz puts dz / (8 N^2) waves of lambda over the pupil, and Strehl = sinc^2 of them.
     shift = 5.0 * WAVE * 50.0**2

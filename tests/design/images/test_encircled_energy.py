@@ -144,3 +144,25 @@ def test_arguments_of_earlier_versions_name_their_place(lsst_r, name, replacemen
     with pytest.raises(ConfigError) as raised:
         encircled_energy(lsst_r, **{name: None})
     assert str(raised.value) == f"{name}: no argument of encircled_energy; expected {replacement}"
+
+
+@pytest.mark.long
+def test_energy_of_a_field_does_not_depend_on_the_other_fields(paraboloid):
+    """Coma of another field made pixels as large as the radius of the Airy disc, and its radii wrong by as much."""
+    telescope = paraboloid(f_number=4.0)
+    fields = np.deg2rad([[0.0, 0.0], [0.0, 0.3]])
+    alone, both = (pachon.encircled_energy(telescope, some_fields, 500e-9) for some_fields in (fields[:1], fields))
+    for fraction in (0.3, 0.5, 0.8, 0.9):
+        # The curve of one field is joined by straight lines 0.17 um long.
+        assert both.radius_holding(fraction)[0] == pytest.approx(alone.radius_holding(fraction)[0], rel=6e-3)
+    assert both.radius_holding(0.5)[1] > 20e-6
+    # Beyond the edge of its own image the curve goes on.
+    assert (np.diff(both.fraction, axis=1) > -1e-6).all()
+    assert both.fraction[0, -1] > alone.fraction[0, -1]
+
+
+def test_widths_of_images_narrower_than_their_pixels_are_not_known(paraboloid):
+    psf = pachon.fft_psf(paraboloid(f_number=4.0), [[0.0, 0.0]], 500e-9, pixel=4e-6, pixels=16)
+    assert np.isnan(psf.fwhm[0])
+    assert psf.summary()["fwhm_um"] == [None]
+    assert "within some pixels" in psf.plot().axes[0].get_xlabel()

@@ -2,10 +2,12 @@
 
 import io
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import trimesh
+from matplotlib.text import Text
 
 import pachon
 from pachon.core.plotting import png_bytes
@@ -152,6 +154,24 @@ def test_bundled_telescopes_can_be_drawn(name):
     found = layout(pachon.load_telescope(name))
     assert png_bytes(found.plot()).startswith(b"\x89PNG")
     assert all(len(fan) for fan in found.fans)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["auxtel", "hsc"])
+def test_names_of_surfaces_overlap_neither_each_other_nor_the_title(name):
+    # AuxTel's lenses stand beside each other behind a fold; HSC's TertiarySpiderSecondPass is long.
+    figure = layout(pachon.load_telescope(name)).plot()
+    figure.canvas.draw()
+    title = figure._suptitle.get_window_extent()
+    for axes in figure.axes:
+        if axes.texts[0].get_rotation():
+            places = np.diff(sorted(text.get_position()[0] for text in axes.texts))
+            assert places.min() > 0.024 * np.ptp(axes.get_xlim())
+        else:
+            # Of the text alone, without its line.
+            boxes = sorted((Text.get_window_extent(text) for text in axes.texts), key=lambda box: box.y0)
+            assert all(lower.y1 < upper.y0 + 1.0 for lower, upper in pairwise(boxes))
+        assert max(text.get_window_extent().y1 for text in axes.texts) < title.y0
 
 
 def test_the_stop_is_drawn_where_the_light_of_the_axis_ends(request):

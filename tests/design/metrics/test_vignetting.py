@@ -122,3 +122,9 @@ def test_bad_input_is_refused(lsst_r, paraboloid):
         footprint(lsst_r, "M4")
     with pytest.raises(DomainError, match=r"surfaces = \[\]"):
         footprint(lsst_r, [])
+
+
+def test_the_scatter_of_a_telescope_without_vignetting_is_no_structure_of_the_plot(paraboloid):
+    profile, sky_map, _ = vignetting(paraboloid(), n_pupil=64).plot().axes
+    assert profile.get_ylim()[0] < 95.0
+    assert sky_map.collections[0].get_clim() == (95.0, 100.0)

@@ -10,6 +10,8 @@ from pachon.design.optimize.jacobian import ParameterColumns
 from pachon.design.optimize.operand import OPERANDS
 from pachon.design.optimize.optimize import optimize
 from pachon.models.parameters.parameters import apply, parse_parameters
+from pachon.models.shapes.shape import Plane
+from pachon.models.surface import Interaction
 
 FIELD = (0.0, float(np.deg2rad(8.0)))
 EDGE = (0.0, float(np.deg2rad(12.0)))
@@ -41,6 +43,16 @@ def test_thicknesses_and_sags_of_spheres(biconvex):
     assert pachon.design.EdgeThickness("S1", 10e-3, minimum=0.0).measure(biconvex) == pytest.approx(
         pachon.design.EdgeThickness("S1", minimum=0.0).measure(biconvex)
     )
+
+
+@pytest.mark.parametrize("name", ["decam", "lsst_v3.3_r_obstructed"])
+def test_edges_are_measured_among_baffles_without_outer_rims(name):
+    telescope = pachon.load_telescope(name)
+    planes = [s for s in telescope.surfaces if isinstance(s.shape, Plane) and s.interaction == Interaction.PASS]
+    edges = [pachon.design.EdgeThickness(s.name, minimum=0.0).measure(telescope) for s in telescope.surfaces[:-1]]
+    least = pachon.operand("MNET", 0.0).measure(telescope)
+    assert least == pytest.approx(min(edges), abs=1e-12)
+    assert edges[0] == pytest.approx(abs(planes[0].vertex[2] - planes[1].vertex[2]), abs=1e-12)
 
 
 def test_back_focus_of_a_thick_lens(biconvex):

@@ -257,10 +257,21 @@ def test_an_ellipse_written_for_optiland_and_read_again(tmp_path):
     assert np.array_equal(ellipse.contains(x, y), np.asarray(peer.contains(-1e3 * x, 1e3 * y)))
 
 
-def test_what_optiland_has_not_is_refused(tmp_path):
-    with pytest.raises(PrescriptionError, match=r"decam: surface .*: aperture Union"):
-        pachon.save_telescope(pachon.load_telescope("decam"), tmp_path / "lens.json")
+@pytest.mark.parametrize("name", ["lens.json", "lens.zmx"])
+def test_apertures_that_a_format_has_not_are_refused_or_left_out(tmp_path, name):
+    decam = pachon.load_telescope("decam")
+    with pytest.raises(
+        PrescriptionError, match=r"surface FILTER_OBSTRUCTION: aperture obscuring Union: a .* has discs"
+    ):
+        pachon.save_telescope(decam, tmp_path / name)
     assert not list(tmp_path.iterdir())
+    with pytest.warns(PrescriptionWarning) as warned:
+        pachon.save_telescope(decam, tmp_path / name, lenient=True)
+    left_out = {str(w.message).split(":")[0].removeprefix("surface ") for w in warned if "left out" in str(w.message)}
+    assert {"FILTER_OBSTRUCTION", "SPIDER"} <= left_out
+    again = pachon.load_telescope(tmp_path / name)
+    for surface in again.surfaces:
+        assert (surface.aperture is None) == (surface.name in left_out or decam.surface(surface.name).aperture is None)
 
 
 def test_air_is_fitted_for_optiland(tmp_path):
