@@ -49,6 +49,8 @@ _PCA_STARS = 2000
 _EXTRA_NOISE = 1.0
 # Range of reduced chi-square outside of which there is a warning.
 _CHI2 = (0.7, 1.4)
+# Largest difference of the pixels of stamps and instrument, over these: scales of cameras are stated to a few per cent.
+_OTHER_PIXELS = 0.05
 # CCDs up to which stars may be less likely with the telescope that they were taken with than without any: of the nine
 # of a raft in four of five exposures, by ln ratios of -8 to -16.
 _FEW_CCDS = 30
@@ -152,8 +154,8 @@ class FocalPlanePsf(ModelFields, Result):
         Raises
         ------
         DomainError
-            If there are fewer than 30 usable stars, a star lies outside the field of the telescope, or an argument is
-            outside its range.
+            If there are fewer than 30 usable stars, a star lies outside the field of the telescope, stamps have other
+            pixels than the instrument, or an argument is outside its range.
         """
         reporter = Reporter(quiet=True) if reporter is None else reporter
         prior = OpticsPrior() if prior is None else prior
@@ -181,6 +183,7 @@ class FocalPlanePsf(ModelFields, Result):
             if catalogue.stamps is not None:
                 stamps = replace(stamps, size=catalogue.stamps.shape[1])
             instrument = replace(believed, stamps=stamps, weight_fwhm=weight)
+            _check_pixels(catalogue, instrument)
             heights = height_prior(mosaic, focal_plane, prior.budget)
         stamp_size = Stamps().size if instrument is None else instrument.stamps.size
         if catalogue.stamps is not None:
@@ -349,6 +352,8 @@ class FocalPlanePsf(ModelFields, Result):
         if given.stamps is None or given.pixel_scale is None:
             return self
         finite = np.flatnonzero(np.isfinite(given.stamps[self.used]).all(axis=(1, 2)))
+        if not finite.size:
+            return self
         brightest = np.argsort(self.field.data.noise[finite, 0], kind="stable")[:_PCA_STARS]
         finite = np.sort(finite[brightest])
         stamps = given.stamps[self.used][finite].astype(np.float64)
@@ -366,6 +371,18 @@ class FocalPlanePsf(ModelFields, Result):
             residuals, stars = (stamps - plain)[reached], (places[reached], weight[reached])
             pca = ResidualImages.fit(residuals, *stars, self.field.mosaic, components, threads)
         return replace(model, pca=pca)
+
+
+def _check_pixels(stars: FocalPlaneStars, instrument: Instrument) -> None:
+    """Raise DomainError where the stamps of stars have other pixels than an instrument, whose images are drawn."""
+    scale, of_instrument = stars.pixel_scale, instrument.pixel_scale
+    if stars.stamps is None or scale is None or abs(scale / of_instrument - 1.0) <= _OTHER_PIXELS:
+        return
+    pixel_um = 1e6 * instrument.stamps.pixel_size * scale / of_instrument
+    raise DomainError(
+        f"pixel_scale = {scale / ARCSEC:.4g} arcsec of the stamps: expected {of_instrument / ARCSEC:.4g}, the pixels of"
+        f" the instrument; Instrument.of(telescope, stamps=Stamps(pixel_size=...)) has others: {pixel_um:.3g} um"
+    )
 
 
 def _fit_warnings(

@@ -19,7 +19,7 @@ from ...core.files import parsing, require_file
 from ...core.number_text import counted
 from ...core.point_plots import draw_points
 from ...core.result import Result
-from ...core.units import ARCSEC
+from ...core.units import ARCSEC, real_array
 from ...measure.shapes import Shapes, measure_shapes
 from ..ccd_product import CcdProduct, ObservedStars, read_product
 from .covariance import Places
@@ -146,21 +146,21 @@ class FocalPlaneStars(Result):
         table : table, structured array or mapping
             Columns as below.
         stamps : array, optional
-            Images of the stars, [n, ny, nx].
+            Images of the stars, centred, [n, size, size].
         pixel_scale, weight_fwhm : float
             Pixel of the stamps, and weight of the moments [rad]; at least a pixel, better 2.5.
 
         Notes
         -----
         Columns, in any case: ``ccd`` (name), ``x``, ``y`` (lengths [m], other units are honoured; ``pix``: pixels of
-        the CCD); ``e1``, ``e2``, ``size`` ([rad] or with a unit), or stamps, in a column ``stamp`` or as `stamps` [n,
-        ny, nx] with `pixel_scale` [rad]; ``snr``, or ``e1_noise``, ``e2_noise`` and ``size_noise`` (relative). Stars
+        the CCD); ``e1``, ``e2``, ``size`` ([rad] or with a unit), or stamps, in a column ``stamp`` or as `stamps`,
+        with `pixel_scale` [rad]; ``snr``, or ``e1_noise``, ``e2_noise`` and ``size_noise`` (relative). Stars
         whose ``used`` is false are left out.
 
         Raises
         ------
         DomainError
-            If a column is missing or has values that are no numbers.
+            If a column is missing or has values that are no numbers, or stamps are not square.
         """
         columns = _columns(table)
         if "ccd" not in columns:
@@ -170,9 +170,12 @@ class FocalPlaneStars(Result):
         if in_pixels != y_in_pixels:
             raise DomainError("stars: columns x and y: expected both in pixels, or both lengths")
         names = [v.decode().strip() if isinstance(v, bytes) else str(v).strip() for v in np.asarray(columns["ccd"])]
-        images = np.asarray(columns["stamp"] if stamps is None and "stamp" in columns else stamps, dtype=np.float64)
+        given_stamps = columns.get("stamp") if stamps is None else stamps
         cube: np.ndarray | None = None
-        if images.ndim == 3:
+        if given_stamps is not None:
+            images = real_array(getattr(given_stamps, "value", given_stamps), "stamps: expected real numbers")
+            if images.ndim != 3 or images.shape[1] != images.shape[2]:
+                raise DomainError(f"stamps have shape {images.shape}: expected [n, size, size]")
             if pixel_scale is None:
                 raise DomainError("stamps: expected pixel_scale, the angle of a pixel in radians")
             if len(images) != len(x):
