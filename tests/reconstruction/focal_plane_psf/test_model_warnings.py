@@ -11,6 +11,7 @@ from pachon.core.units import ARCSEC
 from pachon.models.camera.cameras import load_camera
 from pachon.reconstruction.focal_plane_psf import likelihood
 from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf
+from pachon.reconstruction.focal_plane_psf.mosaic import Mosaic
 from pachon.reconstruction.focal_plane_psf.stars import FocalPlaneStars
 
 
@@ -39,6 +40,12 @@ def test_stamps_of_other_pixels_than_the_instrument_give_one_clear_line(stars, c
     binned = replace(stars, stamps=np.full((60, 15, 15), 1.0 / 225.0), pixel_scale=0.4 * ARCSEC)
     with pytest.raises(DomainError, match=r"^pixel_scale = 0\.4 arcsec of the stamps: expected 0\.2[^\n]*20 um$"):
         FocalPlanePsf.fit(binned, lsst_r, camera=camera)
+
+
+@pytest.mark.parametrize(("ccd", "y"), [(["R22_S11", "R22_S12"], [0.0] * 3), ("R22_S11", [0.0] * 2)])
+def test_places_of_other_numbers_of_ccds_give_one_clear_line(camera, ccd, y):
+    with pytest.raises(DomainError, match=r"^x, y, ccd have shapes [^\n]*$"):
+        Mosaic.of_camera(camera).places(ccd, [0.0] * 3, y)
 
 
 def test_stamps_without_a_whole_one_are_as_none(stars, camera):
