@@ -17,7 +17,7 @@ from astropy.table import Table
 from pydantic import Field
 
 from ...core.errors import ConfigError
-from ...core.products import write_hdus
+from ...core.products import card_text, write_hdus
 from ...core.random_streams import stream
 from ...core.schema import Count, NotNegative, Positive, Section, Whole
 from ...core.set_keys import with_set_keys
@@ -196,7 +196,7 @@ def write_donuts(path: Path, donuts: SimulatedDonuts, scene: DonutScene, model: 
         "field_x": (np.rad2deg(donuts.fields[:, 0]), "deg", "field angle along x"),
         "field_y": (np.rad2deg(donuts.fields[:, 1]), "deg", "field angle along y"),
         "defocus_um": (1e6 * donuts.defocus, "um", "shift along z of what moved"),
-        "moved": ([model.detector.moved] * len(donuts.fields), "", "what the defocus moved"),
+        "moved": ([card_text(model.detector.moved)] * len(donuts.fields), "", "what the defocus moved"),
     }
     for j, values in zip(_NOLL, donuts.zernikes.T, strict=True):
         columns[f"true_Z{j}"] = (1e9 * values, "nm", "true wavefront beyond the telescope believed in")
@@ -214,7 +214,8 @@ def write_donuts(path: Path, donuts: SimulatedDonuts, scene: DonutScene, model: 
         "SEEING": (scene.seeing_arcsec, "FWHM of the long exposure [arcsec]"),
         "SEED": (scene.seed, "seed of all random numbers"),
     }
-    for key, (value, comment) in cards.items():
+    for key, (content, comment) in cards.items():
+        value = card_text(content) if isinstance(content, str) else content
         # A card has 80 characters: a path may leave none for a comment.
         room = 80 - len("KEYWORD = ' ' / ") - len(str(value))
         cube.header[key] = (value, comment) if len(comment) <= room else value
