@@ -14,6 +14,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from ...core.arguments import check_arguments
+from ...core.docstrings import Description
 from ...core.errors import DomainError, ProductError
 from ...core.files import parsing, require_file
 from ...core.number_text import counted
@@ -23,7 +24,7 @@ from ...core.units import ARCSEC, real_array
 from ...measure.shapes import Shapes, measure_shapes
 from ..ccd_product import CcdProduct, ObservedStars, read_product
 from .covariance import Places
-from .mosaic import Mosaic
+from .mosaic import Mosaic, PsfShapes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -80,7 +81,8 @@ class FocalPlaneStars(Result):
         Whether positions are in pixels.
     """
 
-    _table = ("ccd", "x", "y", "values", "noise", "usable")
+    _table = ("ccd", "x", "y", "usable")
+    _row_type = PsfShapes
 
     ccd: tuple[str, ...]
     x: np.ndarray
@@ -101,6 +103,18 @@ class FocalPlaneStars(Result):
 
     def __len__(self) -> int:
         return len(self.x)
+
+    def _columns(self) -> dict[str, Any]:
+        """Return the columns of :meth:`from_table`."""
+        shapes = PsfShapes.of_values(self.values)
+        columns = {"ccd": self.ccd, "x": self.x, "y": self.y, "e1": shapes.e1, "e2": shapes.e2, "size": shapes.size}
+        noise = {f"{name}_noise": values for name, values in zip(("e1", "e2", "size"), self.noise.T, strict=True)}
+        return {**columns, **noise, "usable": self.usable}
+
+    def _described(self, name: str) -> Description:
+        if name in ("x", "y") and self.pixels:
+            return Description("pix", "Positions in pixels of the CCD")
+        return super()._described("noise" if name.endswith("_noise") else name)
 
     @property
     def usable(self) -> np.ndarray:
@@ -214,7 +228,10 @@ class FocalPlaneStars(Result):
     @classmethod
     @check_arguments
     def read(cls, path: str | Path, **options: Any) -> FocalPlaneStars:
-        """Read stars from the folder of a run, or from a FITS or ECSV table with the columns of :meth:`from_table`."""
+        """Read stars from the folder of a run, or from a FITS or ECSV table with the columns of :meth:`from_table`.
+
+        Options are those of :meth:`from_table`; the weight of a table of :meth:`write` is that of its stars.
+        """
         place = Path(path)
         if place.is_dir():
             files = sorted(place.glob("ccd_*.fits"))
@@ -226,8 +243,10 @@ class FocalPlaneStars(Result):
         with parsing(place, "cannot be read as a table of stars", ProductError):
             kind = "fits" if place.suffix.lower() in (".fits", ".fit") else "ascii.ecsv"
             table = Table.read(place, format=kind)
+        meta = {str(key).lower(): value for key, value in table.meta.items()}
+        weight = {"weight_fwhm": meta["weight_fwhm"]} if "weight_fwhm" in meta else {}
         try:
-            return cls.from_table(table, **options)
+            return cls.from_table(table, **weight | options)
         except DomainError as error:
             raise ProductError(error.reason, file=place) from None
 

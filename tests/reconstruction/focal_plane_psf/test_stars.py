@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy import units as u
@@ -131,6 +133,26 @@ def test_positions_in_pixels():
     found = FocalPlaneStars.from_table(table)
     assert found.pixels
     np.testing.assert_array_equal(found.x, 100.0 * np.arange(N))
+
+
+@pytest.mark.parametrize("name", ["stars.ecsv", "stars.fits"])
+@pytest.mark.parametrize("pixels", [False, True])
+def test_written_stars_are_read_as_they_were(tmp_path, name, pixels):
+    """Pixels had metres as their unit, and e1 and e2 the radians of sizes; the columns were no others' to read."""
+    given = replace(FocalPlaneStars.from_table(COLUMNS, weight_fwhm=1.1 * ARCSEC), pixels=pixels)
+    given.write(tmp_path / name)
+    table = Table.read(tmp_path / name)
+    assert [str(table[c].unit or "") for c in ("x", "e1", "size", "size_noise")] == [
+        "pix" if pixels else "m",
+        "",
+        "rad",
+        "",
+    ]
+    read = FocalPlaneStars.read(tmp_path / name)
+    assert (read.ccd, read.pixels) == (given.ccd, pixels)
+    assert read.weight_fwhm == pytest.approx(given.weight_fwhm, rel=1e-8)
+    for key in ("x", "y", "values", "noise"):
+        np.testing.assert_allclose(getattr(read, key), getattr(given, key), rtol=1e-15)
 
 
 def test_stamps_are_measured_and_scaled_to_unit_sum():
