@@ -140,11 +140,12 @@ def simulate_donuts(
     Raises
     ------
     ConfigError
-        If nothing is out of focus, or the layout is not for the telescope.
+        If nothing is out of focus, or the layout is not for the telescope, or excludes stars that are given.
     """
     shift = float(np.reshape(model.detector.shifts(1), ()))
     model = replace(model, air=replace(model.air, fwhm=scene.seeing_arcsec * ARCSEC))
     if scene.layout == "corners":
+        _check_corners(scene, field)
         corners = corner_stars(telescope)
         fields, defocus = corners.fields, corners.heights + shift
     else:
@@ -175,6 +176,16 @@ def simulate_donuts(
         for t in (telescope, true)
     )
     return SimulatedDonuts(images, fields, defocus, (after - before)[:, _NOLL - 1], float(waves.mean()))
+
+
+def _check_corners(scene: DonutScene, field: np.ndarray | None) -> None:
+    """Raise ConfigError for stars that wavefront sensors, with one each on both sides of focus, do not have."""
+    for key in ("stars", "sides"):
+        if getattr(scene, key) != getattr(DonutScene(), key):
+            text = f"{key} = {getattr(scene, key)}: expected none with layout = corners, a star on each sensor"
+            raise ConfigError(text, key=key)
+    if field is not None:
+        raise ConfigError("layout = corners: expected no field of all stars, they stand on the sensors", key="layout")
 
 
 def _stamp_size(telescope: Telescope, fields: np.ndarray, model: DonutModel) -> int:

@@ -8,7 +8,7 @@ from astropy.io import fits
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError
-from pachon.pipeline.simulate.donut_file import DonutScene, SimulatedDonuts, write_donuts
+from pachon.pipeline.simulate.donut_file import DonutScene, SimulatedDonuts, simulate_donuts, write_donuts
 from pachon.sensing.model import DonutModel
 from pachon.sensing.stamp_headers import header_values
 
@@ -128,3 +128,17 @@ def test_a_file_of_donuts_has_the_telescope_of_any_name(tmp_path):
     write_donuts(path, donuts, DonutScene(), model, name)
     with fits.open(path) as hdus:
         assert header_values([hdus[0].header], path).telescope == name
+
+
+@pytest.mark.parametrize(
+    ("scene", "field", "text"),
+    [
+        ({"stars": 3}, None, "stars = 3: expected none with layout = corners"),
+        ({"sides": 2}, None, "sides = 2: expected none with layout = corners"),
+        ({}, np.zeros(2), "layout = corners: expected no field of all stars"),
+    ],
+)
+def test_corners_have_stars_of_their_own(scene, field, text):
+    """Other numbers and places were ignored."""
+    with pytest.raises(ConfigError, match=f"^{text}"):
+        simulate_donuts(LSST, LSST, DonutScene(layout="corners", **scene), DonutModel(), field)
