@@ -135,7 +135,8 @@ class FocalPlanePsf(ModelFields, Result):
         camera : str or Camera, optional
             By default the telescope's. Without one positions must be lengths on one detector plane.
         weight_fwhm : float or Quantity, optional
-            Weight of the moments [rad]; by default that of the stars. That of an instrument is not used.
+            Weight of the moments [rad]; by default that of the stars, and where these state one no other. That of an
+            instrument is not used.
         prior : OpticsPrior, optional
             Prior of unknown heights and of the residual wavefront; by default simulated heights and 0.2 um.
         turbulence : {"exponential", "layers", "forecast"}
@@ -159,8 +160,9 @@ class FocalPlanePsf(ModelFields, Result):
         """
         reporter = Reporter(quiet=True) if reporter is None else reporter
         prior = OpticsPrior() if prior is None else prior
-        catalogue = stars_of(stars)
-        weight = catalogue.weight_fwhm if weight_fwhm is None else positive_angle(weight_fwhm, "weight_fwhm")
+        given_weight = None if weight_fwhm is None else positive_angle(weight_fwhm, "weight_fwhm")
+        catalogue = stars_of(stars, given_weight)
+        weight = given_weight or catalogue.weight_fwhm
         if catalogue.pixel_scale is not None and weight < catalogue.pixel_scale:
             raise DomainError(
                 f"weight_fwhm = {weight / ARCSEC:.3g} arcsec: expected at least a pixel of the stamps,"

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.io import fits
 from astropy.table import MaskedColumn, Table
 
 from pachon.core.errors import DomainError, PachonError, ProductError
@@ -153,6 +154,22 @@ def test_written_stars_are_read_as_they_were(tmp_path, name, pixels):
     assert read.weight_fwhm == pytest.approx(given.weight_fwhm, rel=1e-8)
     for key in ("x", "y", "values", "noise"):
         np.testing.assert_allclose(getattr(read, key), getattr(given, key), rtol=1e-15)
+
+
+def test_another_weight_than_that_of_the_stars_gives_one_clear_line(tmp_path):
+    """Shapes under the one were taken for those under the other: sizes were wrong by a fifth."""
+    line = r"weight_fwhm = 1\.2 arcsec: expected 0\.7, under which the stars were measured$"
+    table = without("e1") | {"snr": np.full(N, 100.0), "stamp": STAMPS}
+    stars = FocalPlaneStars.from_table(table, pixel_scale=PIXEL)
+    with pytest.raises(DomainError, match=f"^{line}"):
+        FocalPlanePsf.fit(stars, camera="lsst", weight_fwhm=1.2 * ARCSEC)
+    with pytest.raises(DomainError, match=r"^weight_fwhm = 1\.2 arcsec: expected 0\.9, "):
+        stars_of(replace(stars, stamps=None, weight_fwhm=0.9 * ARCSEC), 1.2 * ARCSEC)
+    # Tables of shapes need not say theirs.
+    assert stars_of(COLUMNS, 1.2 * ARCSEC).weight_fwhm == pytest.approx(1.2 * ARCSEC)
+    fits.PrimaryHDU(header=fits.Header({"WFWHM": 0.7})).writeto(tmp_path / "ccd_A.fits")
+    with pytest.raises(ProductError, match=rf"ccd_A\.fits: {line}"):
+        FocalPlaneStars.read(tmp_path, weight_fwhm=1.2 * u.arcsec)
 
 
 def test_stamps_are_measured_and_scaled_to_unit_sum():
