@@ -29,6 +29,7 @@ from ...core.progress import Reporter
 from ...core.result import Result
 from ...core.threads import one_blas_thread
 from ...core.units import ARCSEC
+from ...core.version import VERSION
 from ...models.camera.camera import Camera
 from ...models.camera.cameras import load_camera
 from ...models.camera.ccd_surfaces import CcdSurfaces
@@ -287,7 +288,7 @@ class _ExposureJob:
         terms = self.prior.common_terms(places), self.prior.ccd_polynomials(places)
         for array in (data.values, data.noise, places.xy, places.ccd, self.heights, mean, *terms):
             digest.update(np.ascontiguousarray(array).tobytes())
-        digest.update(repr((self.alignment_rms, instrument.key)).encode())
+        digest.update(repr((VERSION, self.alignment_rms, instrument.key)).encode())
         if state is not None:
             digest.update(state.exposure.tobytes())
         return digest.hexdigest()
