@@ -292,7 +292,7 @@ class FocalPlanePsf(ModelFields, Result):
 
     @check_arguments
     def draw(self, ccd: str | Sequence[str], x: ArrayLike, y: ArrayLike, *, threads: int | None = None) -> np.ndarray:
-        """Return images of the PSF, centred and of unit sum, shape [n, ny, nx]; arguments as for :meth:`shapes`.
+        """Return images of the PSF, of unit sum and centred on a pixel, [n, ny, nx]; arguments as for :meth:`shapes`.
 
         Principal components of the residual stamps are added to the image of the optics under the mean of turbulence
         (without a telescope, to the mean star). The sum is convolved with the Gaussian, of positive or negative width,
@@ -370,7 +370,11 @@ class FocalPlanePsf(ModelFields, Result):
             reached = has_shape(plain)
             if not reached.any():
                 return model
-            residuals, stars = (stamps - plain)[reached], (places[reached], weight[reached])
+            # The sum over a thousand pixels of sky is off by far more than the light of a faint star is.
+            flux = np.einsum("nyx,nyx->n", stamps, plain) / np.einsum("nyx,nyx->n", plain, plain)
+            reached &= flux > 0.0
+            residuals = stamps[reached] / flux[reached, None, None] - plain[reached]
+            stars = places[reached], weight[reached]
             pca = ResidualImages.fit(residuals, *stars, self.field.mosaic, components, threads)
         return replace(model, pca=pca)
 
