@@ -118,7 +118,7 @@ class ResidualImages:
     def fit(
         cls, residuals: np.ndarray, places: Places, weight: np.ndarray, mosaic: Mosaic, count: int, threads: int | None
     ) -> ResidualImages | None:
-        """Fit up to `count` components to residual stamps [n, ny, nx] that predict stars left out; None if there are none.
+        """Fit up to `count` components of residual stamps [n, ny, nx] that predict stars left out; None without any.
 
         `weight` [n] are the inverse variances of the stars but for a factor. The noise of a pixel is that of the
         corners of the stamps: where photons of the star make more, components may be theirs, which predict nothing.
