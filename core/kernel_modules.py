@@ -28,7 +28,7 @@ def kernels_by_module() -> dict[str, wp.Kernel]:
 
 def _kernel_files() -> list[str]:
     """Return the dotted names of the files that Warp compiles."""
-    paths = [path for folder in PACKAGES for path in (_ROOT / folder).rglob("*.py")]
+    paths = [path for folder in ("core", *PACKAGES) for path in (_ROOT / folder).rglob("*.py")]
     kernels = [p for p in paths if p.stem.endswith("_kernels") or p.parent == _ROOT / "raytrace" / "kernels"]
     return sorted(".".join(p.relative_to(_ROOT).with_suffix("").parts) for p in kernels if p.stem != "__init__")
 

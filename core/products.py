@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +28,8 @@ _WHEN = "FITS checksum"
 _FORMATS = {"f": "D", "i": "J", "b": "L"}
 #: Largest whole number of the format J.
 _LARGEST_INT = np.iinfo(np.int32).max
+# Python escape of a character beyond ASCII.
+_ESCAPE = re.compile(r"\\x[89a-f][0-9a-f]|\\u[0-9a-f]{4}|\\U[0-9a-f]{8}")
 #: Columns of a table in order, by name: values, unit in FITS notation (empty for pure numbers), description.
 Columns = dict[str, tuple[np.ndarray, str, str]]
 #: Keyword, value and comment of a line of a FITS header.
@@ -62,6 +65,11 @@ class Stamp:
 def card_text(text: str) -> str:
     r"""Return a text as a FITS card or column holds it: ASCII, other characters as Python escapes such as ``\xfc``."""
     return text.encode("ascii", "backslashreplace").decode()
+
+
+def text_of_card(text: str) -> str:
+    """Return the text that :func:`card_text` has made ASCII."""
+    return _ESCAPE.sub(lambda escape: chr(int(escape[0][2:], 16)), text)
 
 
 def write_fits(path: Path, hdus: list[Any], stamp: Stamp | None, cards: Sequence[Card]) -> None:

@@ -177,7 +177,7 @@ def write_table(
     """Write a table in the format of the file's ending; Parquet takes the columns alone, and needs ``pyarrow``.
 
     Images, arrays with unit and description by name, become extensions of FITS files, with the cards; others leave them
-    out.
+    out. Texts of FITS files are ASCII, with Python escapes of other characters.
 
     Raises
     ------
@@ -201,7 +201,7 @@ def _encoded(table: Table, kind: str, path: Path, images: Mapping[str, Described
         with warnings.catch_warnings():
             # Long keywords become HIERARCH cards; units that FITS lacks, such as electron, are kept for astropy.
             warnings.simplefilter("ignore", AstropyUserWarning)
-            table.write(data, format="fits")
+            _with_ascii_texts(table).write(data, format="fits")
         if not images:
             return data.getvalue()
         hdus = fits.open(io.BytesIO(data.getvalue()))
@@ -211,13 +211,30 @@ def _encoded(table: Table, kind: str, path: Path, images: Mapping[str, Described
                 hdu.header["BUNIT"] = unit
             hdu.header["COMMENT"] = card_text(meaning)
             for key, value, comment in cards:
-                hdu.header[key] = (value, comment)
+                hdu.header[key] = (card_text(value) if isinstance(value, str) else value, comment)
             hdus.append(hdu)
         file_data = io.BytesIO()
         hdus.writeto(file_data)
         return file_data.getvalue()
     columns: Columns = {name: (np.asarray(table[name]), "", "") for name in table.colnames}
     return parquet_bytes(path, columns, error=ConfigError)
+
+
+def _with_ascii_texts(table: Table) -> Table:
+    """Return a table with the texts that FITS takes: names, cells and metadata by :func:`~.products.card_text`."""
+    ascii_table = table.copy(copy_data=False)
+    for key, value in table.meta.items():
+        ascii_table.meta[key] = card_text(value) if isinstance(value, str) else value
+    for name in table.colnames:
+        column = ascii_table[name]
+        column.info.description = card_text(column.info.description or "") or None
+        cells = np.asarray(column).ravel().tolist() if column.dtype.kind == "U" else []
+        if not all(map(str.isascii, cells)):
+            texts = np.array(list(map(card_text, cells))).reshape(column.shape)
+            ascii_table[name] = column.__class__(texts, description=column.info.description)
+        if not name.isascii():
+            ascii_table.rename_column(name, card_text(name).replace("\\", "_"))
+    return ascii_table
 
 
 def parquet_bytes(

@@ -112,8 +112,8 @@ class Experiment:
         if config.active_optics.residual_um > 0.0:
             rms = config.active_optics.residual_um * 1e-6
             aberration = ResidualWavefront.draw(telescope, rms, config.seed, config.atmosphere.epoch)
-        focal_plane, atmosphere = _focal_plane(config, resolved.camera), _atmosphere(config, site)
         check_samples(config, telescope)
+        focal_plane, atmosphere = _focal_plane(config, resolved.camera), _atmosphere(config, site)
         listed = listed_stars(config, telescope, resolved.camera)
         return cls(config, telescope, focal_plane, atmosphere, aberration, site, star_list=listed)
 

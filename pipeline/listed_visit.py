@@ -112,7 +112,10 @@ def visit_experiment(config: Configuration, visit: ListedVisit, folder: Path | N
         photometry = settings.photometry.model_copy(update=updates)
         settings = settings.model_copy(update={"photometry": photometry})
         if settings.stars.catalogue is not None:
-            return Experiment.from_config(settings)
+            # Limits that are not given are those of this sky and these snaps.
+            limits = {key: getattr(config.stars, key) for key in ("brightest", "faintest")}
+            stars = settings.stars.model_copy(update=limits)
+            return Experiment.from_config(settings.model_copy(update={"stars": stars}))
         return replace(experiment, config=settings)
 
 

@@ -21,7 +21,7 @@ from .psf_model.polynomial import as_positions
 #: Column of the images of a model.
 _COLUMN = "PSF_MASK"
 #: Names of SExtractor's positions in pixels, along x and along y.
-_POSITIONS = (("X_IMAGE", "XWIN_IMAGE", "XPSF_IMAGE", "XPEAK_IMAGE"), ("Y_IMAGE", "YWIN_IMAGE", "YPSF_IMAGE"))
+_POSITIONS = tuple(tuple(f"{axis}{kind}_IMAGE" for kind in ("", "WIN", "PSF", "PEAK")) for axis in "XY")
 #: Half-width of the Lanczos kernel between the samples of a model, as in PSFEx and GalSim.
 _LANCZOS = 3
 

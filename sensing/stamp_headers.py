@@ -15,6 +15,7 @@ import numpy as np
 from astropy.io import fits
 
 from ..core.errors import ProductError
+from ..core.products import text_of_card
 
 #: Cameras by the names of instruments in headers, in lower case without separators.
 _INSTRUMENTS = {
@@ -126,7 +127,7 @@ def header_values(headers: Iterable[fits.Header], file: Path) -> HeaderValues:
     simulated = next((h for h in listed if TELESCOPE_KEY in h), None)
     if simulated is None:
         return HeaderValues(camera, rotator, parallactic, band, wavelength, gain)
-    telescope, pixel = str(simulated[TELESCOPE_KEY]).strip(), 1e-6 * _number(simulated, PIXEL_KEY, file)
+    telescope, pixel = text_of_card(str(simulated[TELESCOPE_KEY]).strip()), 1e-6 * _number(simulated, PIXEL_KEY, file)
     wavelength = 1e-9 * _number(simulated, WAVELENGTH_KEY, file)
     return HeaderValues(camera, rotator, parallactic, band, wavelength, gain, telescope, pixel)
 

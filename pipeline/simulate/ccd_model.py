@@ -182,7 +182,7 @@ def _modelled(experiment: Experiment, ccds: Sequence[_ExposedCcd], *, noisy: boo
     def stars_of(ccd: _ExposedCcd, observation: Observation | PachonError) -> tuple[_ExposedCcd, Observation, CcdStars]:
         if isinstance(observation, PachonError):
             raise observation
-        return ccd, observation, model_stars(experiment, observation, ccd.stars, ccd.snr)
+        return ccd, observation, model_stars(experiment, observation, ccd.stars, ccd.collected.electrons, ccd.snr)
 
     def fit(ccds: Sequence[tuple[_ExposedCcd, Observation, CcdStars]]) -> list[_ModelledCcd | PachonError]:
         models = fit_ccd_models(experiment, [stars for _, _, stars in ccds], noisy=noisy)
@@ -324,13 +324,18 @@ def _product(experiment: Experiment, compared: _ComparedCcd, jacobians: Sequence
     )
 
 
-def model_stars(experiment: Experiment, observation: Observation, stars: StarField, snr: np.ndarray) -> CcdStars:
-    """Return the observed stars of one CCD, S/N [n], that its model is fitted to; DomainError if they are too few."""
+def model_stars(
+    experiment: Experiment, observation: Observation, stars: StarField, electrons: np.ndarray, snr: np.ndarray
+) -> CcdStars:
+    """Return the observed stars of one CCD that its model is fitted to; DomainError if they are too few.
+
+    Collected `electrons` and S/N are those of all stars, [n].
+    """
     recipe, used = experiment.config.reconstruction.psf_recipe(), observation.used
     require_stars(used, observation.defects, least_star_count(experiment.config))
     images, colours = observation.images[used], star_colours(experiment, stars)
     if recipe.interpolation.needs_noise:  # in electrons
-        images = images * stars.electrons[used, None, None]
+        images = images * electrons[used, None, None]
     return CcdStars(
         images,
         stars.observed[used],

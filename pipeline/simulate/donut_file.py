@@ -17,7 +17,7 @@ from astropy.table import Table
 from pydantic import Field
 
 from ...core.errors import ConfigError
-from ...core.products import write_hdus
+from ...core.products import card_text, write_hdus
 from ...core.random_streams import stream
 from ...core.schema import Count, NotNegative, Positive, Section, Whole
 from ...core.set_keys import with_set_keys
@@ -140,16 +140,12 @@ def simulate_donuts(
     Raises
     ------
     ConfigError
-        If nothing is out of focus, or the layout is not for the telescope.
+        If nothing is out of focus, or the layout is not for the telescope, or excludes stars that are given.
     """
     shift = float(np.reshape(model.detector.shifts(1), ()))
     model = replace(model, air=replace(model.air, fwhm=scene.seeing_arcsec * ARCSEC))
     if scene.layout == "corners":
-        if telescope.camera not in (None, "lsst"):
-            raise ConfigError(
-                f"layout = corners: {telescope.name} has the camera {telescope.camera}; expected the LSST's, or random",
-                key="layout",
-            )
+        _check_corners(telescope, scene, field)
         corners = corner_stars(telescope)
         fields, defocus = corners.fields, corners.heights + shift
     else:
@@ -182,6 +178,24 @@ def simulate_donuts(
     return SimulatedDonuts(images, fields, defocus, (after - before)[:, _NOLL - 1], float(waves.mean()))
 
 
+def _check_corners(telescope: Telescope, scene: DonutScene, field: np.ndarray | None) -> None:
+    """Raise ConfigError for another camera than the LSST's, and for stars that its wavefront sensors do not have.
+
+    Each sensor has one star on one side of focus.
+    """
+    if telescope.camera not in (None, "lsst"):
+        raise ConfigError(
+            f"layout = corners: {telescope.name} has the camera {telescope.camera}; expected the LSST's, or random",
+            key="layout",
+        )
+    for key in ("stars", "sides"):
+        if getattr(scene, key) != getattr(DonutScene(), key):
+            text = f"{key} = {getattr(scene, key)}: expected none with layout = corners, a star on each sensor"
+            raise ConfigError(text, key=key)
+    if field is not None:
+        raise ConfigError("layout = corners: expected no field of all stars, they stand on the sensors", key="layout")
+
+
 def _stamp_size(telescope: Telescope, fields: np.ndarray, model: DonutModel) -> int:
     """Return a side of stamps that holds donuts at fields, and the wings of their seeing [pixels]."""
     angle = 2.0 * np.pi * np.arange(_RIM_POINTS) / _RIM_POINTS
@@ -201,7 +215,7 @@ def write_donuts(path: Path, donuts: SimulatedDonuts, scene: DonutScene, model: 
         "field_x": (np.rad2deg(donuts.fields[:, 0]), "deg", "field angle along x"),
         "field_y": (np.rad2deg(donuts.fields[:, 1]), "deg", "field angle along y"),
         "defocus_um": (1e6 * donuts.defocus, "um", "shift along z of what moved"),
-        "moved": ([model.detector.moved] * len(donuts.fields), "", "what the defocus moved"),
+        "moved": ([card_text(model.detector.moved)] * len(donuts.fields), "", "what the defocus moved"),
     }
     for j, values in zip(_NOLL, donuts.zernikes.T, strict=True):
         columns[f"true_Z{j}"] = (1e9 * values, "nm", "true wavefront beyond the telescope believed in")
@@ -219,7 +233,8 @@ def write_donuts(path: Path, donuts: SimulatedDonuts, scene: DonutScene, model: 
         "SEEING": (scene.seeing_arcsec, "FWHM of the long exposure [arcsec]"),
         "SEED": (scene.seed, "seed of all random numbers"),
     }
-    for key, (value, comment) in cards.items():
+    for key, (content, comment) in cards.items():
+        value = card_text(content) if isinstance(content, str) else content
         # A card has 80 characters: a path may leave none for a comment.
         room = 80 - len("KEYWORD = ' ' / ") - len(str(value))
         cube.header[key] = (value, comment) if len(comment) <= room else value

@@ -16,8 +16,8 @@ import numpy as np
 
 from ...measure.shapes import measure_shapes
 from .covariance import Covariance, Places
-from .kriging import map_on_threads, neighbourhood, neighbours_of
-from .likelihood import fit_covariance
+from .kriging import leave_one_out, map_on_threads, neighbourhood, neighbours_of
+from .likelihood import blocks_of, fit_covariance
 from .mosaic import Mosaic
 
 # The three deformations, as coefficients of kx^2, ky^2 and kx ky: along x, along x = y, and round.
@@ -34,8 +34,9 @@ _ROOM = 8
 
 @np.errstate(over="ignore", invalid="ignore")
 def with_shapes(images: np.ndarray, values: np.ndarray, pixel_scale: float, weight_fwhm: float) -> np.ndarray:
-    """Convolve images [n, ny, nx] to the shapes e1, e2, ln size [n, 3]; the result is centred and of unit sum.
+    """Convolve images [n, ny, nx] to the shapes e1, e2, ln size [n, 3]; the result is of unit sum.
 
+    Its centroids are the centres of the pixels [ny // 2, nx // 2].
     Where no image has the shape (:func:`has_shape`), it is of another one, or not finite.
     """
     ny, nx = images.shape[1:]
@@ -45,6 +46,7 @@ def with_shapes(images: np.ndarray, values: np.ndarray, pixel_scale: float, weig
     kx = 2.0 * np.pi * np.fft.rfftfreq(nx + 2 * _ROOM)
     forms = np.einsum("sp,pyx->syx", _SHAPES, np.stack(np.broadcast_arrays(kx**2, ky**2, kx * ky)))
     amounts, shift = np.zeros((len(images), 3)), np.zeros((len(images), 2))
+    middle = np.array([nx // 2 - 0.5 * (nx - 1), ny // 2 - 0.5 * (ny - 1)])
 
     def image(amounts: np.ndarray, shift: np.ndarray) -> np.ndarray:
         exponent = -0.5 * np.einsum("ns,syx->nyx", amounts, forms)
@@ -54,9 +56,8 @@ def with_shapes(images: np.ndarray, values: np.ndarray, pixel_scale: float, weig
 
     def measured(stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         moments = measure_shapes(stamps, pixel_scale, weight_fwhm)
-        return np.stack([moments.e1, moments.e2, np.log(moments.size)], axis=1), np.stack(
-            [moments.x, moments.y], axis=1
-        )
+        centroids = np.stack([moments.x, moments.y], axis=1)
+        return np.stack([moments.e1, moments.e2, np.log(moments.size)], axis=1), centroids - middle
 
     image_shapes, centre = measured(image(amounts, shift))
     jacobian = np.empty((len(images), 3, 3))
@@ -117,10 +118,10 @@ class ResidualImages:
     def fit(
         cls, residuals: np.ndarray, places: Places, weight: np.ndarray, mosaic: Mosaic, count: int, threads: int | None
     ) -> ResidualImages | None:
-        """Fit up to `count` components to residual stamps [n, ny, nx]; None if none of them is above the noise.
+        """Fit up to `count` components of residual stamps [n, ny, nx] that predict stars left out; None without any.
 
         `weight` [n] are the inverse variances of the stars but for a factor. The noise of a pixel is that of the
-        corners of the stamps.
+        corners of the stamps: where photons of the star make more, components may be theirs, which predict nothing.
         """
         n, ny, nx = residuals.shape
         flat = (residuals - residuals.mean(axis=(1, 2), keepdims=True)).reshape(n, -1)
@@ -139,11 +140,18 @@ class ResidualImages:
         coefficients = np.einsum("np,kp->nk", flat, components)
         noise = np.repeat((sigma / root) ** 2, keep, axis=1)
 
-        def covariance(k: int) -> Covariance:
-            return fit_covariance(places, coefficients[:, k], noise[:, k], max_iterations=25).covariance
+        def covariance(k: int) -> Covariance | None:
+            values, variances = coefficients[:, k], noise[:, k]
+            fitted = fit_covariance(places, values, variances, max_iterations=25).covariance
+            return fitted if _predicts(fitted, places, values, variances) else None
 
-        covariances = tuple(map_on_threads(covariance, range(keep), threads))
-        return cls(mosaic, components.reshape(keep, ny, nx), places, coefficients, noise, covariances)
+        fitted = dict(enumerate(map_on_threads(covariance, range(keep), threads)))
+        covariances = {k: covariance for k, covariance in fitted.items() if covariance is not None}
+        if not covariances:
+            return None
+        kept = list(covariances)
+        images = components.reshape(keep, ny, nx)[kept]
+        return cls(mosaic, images, places, coefficients[:, kept], noise[:, kept], tuple(covariances.values()))
 
     def at(self, places: Places, threads: int | None = None) -> np.ndarray:
         """Return the sum of the components at places, shape [n, ny, nx]."""
@@ -161,3 +169,12 @@ class ResidualImages:
         for at, amounts in map_on_threads(job, np.unique(places.ccd), threads):
             amount[at] = amounts
         return np.einsum("nk,kyx->nyx", amount, self.components)
+
+
+def _predicts(covariance: Covariance, places: Places, values: np.ndarray, noise: np.ndarray) -> bool:
+    """Return whether predictions of values [n] by the other stars of their blocks are better than zero."""
+    left_out = np.empty(len(values))
+    for index in blocks_of(places.xy):
+        near = neighbourhood(covariance, places, values[:, None], noise[:, None], index)
+        left_out[index] = leave_one_out(near)[0][:, 0]
+    return bool((left_out**2 / noise).sum() < (values**2 / noise).sum())

@@ -49,6 +49,8 @@ _PCA_STARS = 2000
 _EXTRA_NOISE = 1.0
 # Range of reduced chi-square outside of which there is a warning.
 _CHI2 = (0.7, 1.4)
+# Largest difference of the pixels of stamps and instrument, over these: scales of cameras are stated to a few per cent.
+_OTHER_PIXELS = 0.05
 # CCDs up to which stars may be less likely with the telescope that they were taken with than without any: of the nine
 # of a raft in four of five exposures, by ln ratios of -8 to -16.
 _FEW_CCDS = 30
@@ -133,7 +135,8 @@ class FocalPlanePsf(ModelFields, Result):
         camera : str or Camera, optional
             By default the telescope's. Without one positions must be lengths on one detector plane.
         weight_fwhm : float or Quantity, optional
-            Weight of the moments [rad]; by default that of the stars. That of an instrument is not used.
+            Weight of the moments [rad]; by default that of the stars, and where these state one no other. That of an
+            instrument is not used.
         prior : OpticsPrior, optional
             Prior of unknown heights and of the residual wavefront; by default simulated heights and 0.2 um.
         turbulence : {"exponential", "layers", "forecast"}
@@ -152,13 +155,14 @@ class FocalPlanePsf(ModelFields, Result):
         Raises
         ------
         DomainError
-            If there are fewer than 30 usable stars, a star lies outside the field of the telescope, or an argument is
-            outside its range.
+            If there are fewer than 30 usable stars, a star lies outside the field of the telescope, stamps have other
+            pixels than the instrument, or an argument is outside its range.
         """
         reporter = Reporter(quiet=True) if reporter is None else reporter
         prior = OpticsPrior() if prior is None else prior
-        catalogue = stars_of(stars)
-        weight = catalogue.weight_fwhm if weight_fwhm is None else positive_angle(weight_fwhm, "weight_fwhm")
+        given_weight = None if weight_fwhm is None else positive_angle(weight_fwhm, "weight_fwhm")
+        catalogue = stars_of(stars, given_weight)
+        weight = given_weight or catalogue.weight_fwhm
         if catalogue.pixel_scale is not None and weight < catalogue.pixel_scale:
             raise DomainError(
                 f"weight_fwhm = {weight / ARCSEC:.3g} arcsec: expected at least a pixel of the stamps,"
@@ -181,6 +185,7 @@ class FocalPlanePsf(ModelFields, Result):
             if catalogue.stamps is not None:
                 stamps = replace(stamps, size=catalogue.stamps.shape[1])
             instrument = replace(believed, stamps=stamps, weight_fwhm=weight)
+            _check_pixels(catalogue, instrument)
             heights = height_prior(mosaic, focal_plane, prior.budget)
         stamp_size = Stamps().size if instrument is None else instrument.stamps.size
         if catalogue.stamps is not None:
@@ -287,7 +292,7 @@ class FocalPlanePsf(ModelFields, Result):
 
     @check_arguments
     def draw(self, ccd: str | Sequence[str], x: ArrayLike, y: ArrayLike, *, threads: int | None = None) -> np.ndarray:
-        """Return images of the PSF, centred and of unit sum, shape [n, ny, nx]; arguments as for :meth:`shapes`.
+        """Return images of the PSF, of unit sum and centred on a pixel, [n, ny, nx]; arguments as for :meth:`shapes`.
 
         Principal components of the residual stamps are added to the image of the optics under the mean of turbulence
         (without a telescope, to the mean star). The sum is convolved with the Gaussian, of positive or negative width,
@@ -349,6 +354,8 @@ class FocalPlanePsf(ModelFields, Result):
         if given.stamps is None or given.pixel_scale is None:
             return self
         finite = np.flatnonzero(np.isfinite(given.stamps[self.used]).all(axis=(1, 2)))
+        if not finite.size:
+            return self
         brightest = np.argsort(self.field.data.noise[finite, 0], kind="stable")[:_PCA_STARS]
         finite = np.sort(finite[brightest])
         stamps = given.stamps[self.used][finite].astype(np.float64)
@@ -363,9 +370,25 @@ class FocalPlanePsf(ModelFields, Result):
             reached = has_shape(plain)
             if not reached.any():
                 return model
-            residuals, stars = (stamps - plain)[reached], (places[reached], weight[reached])
+            # The sum over a thousand pixels of sky is off by far more than the light of a faint star is.
+            flux = np.einsum("nyx,nyx->n", stamps, plain) / np.einsum("nyx,nyx->n", plain, plain)
+            reached &= flux > 0.0
+            residuals = stamps[reached] / flux[reached, None, None] - plain[reached]
+            stars = places[reached], weight[reached]
             pca = ResidualImages.fit(residuals, *stars, self.field.mosaic, components, threads)
         return replace(model, pca=pca)
+
+
+def _check_pixels(stars: FocalPlaneStars, instrument: Instrument) -> None:
+    """Raise DomainError where the stamps of stars have other pixels than an instrument, whose images are drawn."""
+    scale, of_instrument = stars.pixel_scale, instrument.pixel_scale
+    if stars.stamps is None or scale is None or abs(scale / of_instrument - 1.0) <= _OTHER_PIXELS:
+        return
+    pixel_um = 1e6 * instrument.stamps.pixel_size * scale / of_instrument
+    raise DomainError(
+        f"pixel_scale = {scale / ARCSEC:.4g} arcsec of the stamps: expected {of_instrument / ARCSEC:.4g}, the pixels of"
+        f" the instrument; Instrument.of(telescope, stamps=Stamps(pixel_size=...)) has others: {pixel_um:.3g} um"
+    )
 
 
 def _fit_warnings(

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError, unknown_name
 from ...core.point_plots import draw_shapes
-from ...core.units import ARCSEC, metres
+from ...core.units import ARCSEC, broadcast_together, metres
 from ...models.camera.camera import Camera
 from .covariance import Places
 
@@ -85,7 +85,7 @@ class Mosaic:
             axis = "xy"[in_pixels.index(True)]
             raise DomainError(f"{axis} in pixels: expected a camera, or positions on the detector in metres")
         px, py = (x.value, y.value) if all(in_pixels) else (metres(x, "x"), metres(y, "y"))
-        px, py, numbers = np.broadcast_arrays(np.atleast_1d(px), np.atleast_1d(py), numbers)
+        px, py, numbers = broadcast_together({"x": np.atleast_1d(px), "y": np.atleast_1d(py), "ccd": numbers})
         xy, numbers = np.stack([px.ravel(), py.ravel()], axis=1), numbers.ravel()
         if all(in_pixels) and self.camera is not None:
             xy = self.camera.from_pixel(numbers, xy)

@@ -9,7 +9,6 @@ import numpy as np
 
 from ...models.camera.focal_plane import FocalPlane
 from ...wavefront.aberration import ResidualWavefront
-from ...wavefront.psf.engine import center_focal_length
 from .covariance import Places
 from .heights import HeightPrior
 from .response import ExposureResponse, Instrument
@@ -51,8 +50,7 @@ class OpticsPart:
     @property
     def pixel_scale(self) -> float:
         """Angle of a pixel of the images [rad]."""
-        instrument = self.instrument
-        return instrument.stamps.pixel_size / center_focal_length(instrument.telescope, instrument.wavelengths)
+        return self.instrument.pixel_scale
 
     def shapes(
         self, places: Places, threads: int | None = None, progress: Callable[[int], None] | None = None

@@ -154,6 +154,11 @@ class Instrument:
         return np.asarray(self.light.wavelengths)
 
     @property
+    def pixel_scale(self) -> float:
+        """Angle of a pixel of the stamps [rad]."""
+        return self.stamps.pixel_size / center_focal_length(self.telescope, self.wavelengths)
+
+    @property
     def key(self) -> str:
         """SHA-256 of all parameters."""
         air, stamps, light = self.atmosphere, self.stamps, self.light

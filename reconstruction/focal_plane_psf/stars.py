@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,16 +15,17 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from ...core.arguments import check_arguments
+from ...core.docstrings import Description
 from ...core.errors import DomainError, ProductError
 from ...core.files import parsing, require_file
 from ...core.number_text import counted
 from ...core.point_plots import draw_points
 from ...core.result import Result
-from ...core.units import ARCSEC
+from ...core.units import ARCSEC, positive_angle, real_array
 from ...measure.shapes import Shapes, measure_shapes
 from ..ccd_product import CcdProduct, ObservedStars, read_product
 from .covariance import Places
-from .mosaic import Mosaic
+from .mosaic import Mosaic, PsfShapes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
 
 #: Noise of e1, e2 and ln size times the S/N, of stars as wide as the weight, where no stamps are given.
 NOISE_PER_SNR = (0.50, 0.50, 0.52)
+# Relative difference of weights that are the same.
+_SAME_WEIGHT = 1e-6
 # Pixels of the mean star that are changed at a time: of all at once, wide stamps would fill the memory.
 _PIXELS_TOGETHER = 1024
 
@@ -80,7 +84,8 @@ class FocalPlaneStars(Result):
         Whether positions are in pixels.
     """
 
-    _table = ("ccd", "x", "y", "values", "noise", "usable")
+    _table = ("ccd", "x", "y", "usable")
+    _row_type = PsfShapes
 
     ccd: tuple[str, ...]
     x: np.ndarray
@@ -101,6 +106,18 @@ class FocalPlaneStars(Result):
 
     def __len__(self) -> int:
         return len(self.x)
+
+    def _columns(self) -> dict[str, Any]:
+        """Return the columns of :meth:`from_table`."""
+        shapes = PsfShapes.of_values(self.values)
+        columns = {"ccd": self.ccd, "x": self.x, "y": self.y, "e1": shapes.e1, "e2": shapes.e2, "size": shapes.size}
+        noise = {f"{name}_noise": values for name, values in zip(("e1", "e2", "size"), self.noise.T, strict=True)}
+        return {**columns, **noise, "usable": self.usable}
+
+    def _described(self, name: str) -> Description:
+        if name in ("x", "y") and self.pixels:
+            return Description("pix", "Positions in pixels of the CCD")
+        return super()._described("noise" if name.endswith("_noise") else name)
 
     @property
     def usable(self) -> np.ndarray:
@@ -146,21 +163,21 @@ class FocalPlaneStars(Result):
         table : table, structured array or mapping
             Columns as below.
         stamps : array, optional
-            Images of the stars, [n, ny, nx].
+            Images of the stars, centred, [n, size, size].
         pixel_scale, weight_fwhm : float
             Pixel of the stamps, and weight of the moments [rad]; at least a pixel, better 2.5.
 
         Notes
         -----
         Columns, in any case: ``ccd`` (name), ``x``, ``y`` (lengths [m], other units are honoured; ``pix``: pixels of
-        the CCD); ``e1``, ``e2``, ``size`` ([rad] or with a unit), or stamps, in a column ``stamp`` or as `stamps` [n,
-        ny, nx] with `pixel_scale` [rad]; ``snr``, or ``e1_noise``, ``e2_noise`` and ``size_noise`` (relative). Stars
+        the CCD); ``e1``, ``e2``, ``size`` ([rad] or with a unit), or stamps, in a column ``stamp`` or as `stamps`,
+        with `pixel_scale` [rad]; ``snr``, or ``e1_noise``, ``e2_noise`` and ``size_noise`` (relative). Stars
         whose ``used`` is false are left out.
 
         Raises
         ------
         DomainError
-            If a column is missing or has values that are no numbers.
+            If a column is missing or has values that are no numbers, or stamps are not square.
         """
         columns = _columns(table)
         if "ccd" not in columns:
@@ -170,9 +187,12 @@ class FocalPlaneStars(Result):
         if in_pixels != y_in_pixels:
             raise DomainError("stars: columns x and y: expected both in pixels, or both lengths")
         names = [v.decode().strip() if isinstance(v, bytes) else str(v).strip() for v in np.asarray(columns["ccd"])]
-        images = np.asarray(columns["stamp"] if stamps is None and "stamp" in columns else stamps, dtype=np.float64)
+        given_stamps = columns.get("stamp") if stamps is None else stamps
         cube: np.ndarray | None = None
-        if images.ndim == 3:
+        if given_stamps is not None:
+            images = real_array(getattr(given_stamps, "value", given_stamps), "stamps: expected real numbers")
+            if images.ndim != 3 or images.shape[1] != images.shape[2]:
+                raise DomainError(f"stamps have shape {images.shape}: expected [n, size, size]")
             if pixel_scale is None:
                 raise DomainError("stamps: expected pixel_scale, the angle of a pixel in radians")
             if len(images) != len(x):
@@ -211,20 +231,29 @@ class FocalPlaneStars(Result):
     @classmethod
     @check_arguments
     def read(cls, path: str | Path, **options: Any) -> FocalPlaneStars:
-        """Read stars from the folder of a run, or from a FITS or ECSV table with the columns of :meth:`from_table`."""
+        """Read stars from the folder of a run, or from a FITS or ECSV table with the columns of :meth:`from_table`.
+
+        Options are those of :meth:`from_table`. Runs, and tables of :meth:`write`, have the weight of their stars.
+        """
         place = Path(path)
         if place.is_dir():
             files = sorted(place.glob("ccd_*.fits"))
             if not files:
                 raise ProductError("no products of a run (ccd_*.fits)", file=place)
+            weight = _product_weight_fwhm(files[0])
+            given = positive_angle(options.pop("weight_fwhm", weight), "weight_fwhm")
+            if not same_weight(given, weight):
+                raise ProductError(other_weight(given, weight), file=files[0])
             products = [read_product(f, holdout_images=False) for f in files]
-            return cls.from_products(products, **{"weight_fwhm": _product_weight_fwhm(files[0])} | options)
+            return cls.from_products(products, weight, **options)
         require_file(place, ProductError)
         with parsing(place, "cannot be read as a table of stars", ProductError):
             kind = "fits" if place.suffix.lower() in (".fits", ".fit") else "ascii.ecsv"
             table = Table.read(place, format=kind)
+        meta = {str(key).lower(): value for key, value in table.meta.items()}
+        of_file = {"weight_fwhm": meta["weight_fwhm"]} if "weight_fwhm" in meta else {}
         try:
-            return cls.from_table(table, **options)
+            return cls.from_table(table, **of_file | options)
         except DomainError as error:
             raise ProductError(error.reason, file=place) from None
 
@@ -313,13 +342,32 @@ def places_of(mosaic: Mosaic, stars: FocalPlaneStars) -> Places:
     return mosaic.places(stars.ccd, x, y)
 
 
-def stars_of(stars: Any) -> FocalPlaneStars:
-    """Return stars given in any of the accepted ways: themselves, a table, or the path of a file or of a run."""
-    if isinstance(stars, FocalPlaneStars):
-        return stars
+def stars_of(stars: Any, weight_fwhm: float | None = None) -> FocalPlaneStars:
+    """Return stars given in any of the accepted ways: themselves, a table, or the path of a file or of a run.
+
+    Under a weight of the moments [rad] other than theirs, where it is known, they are a DomainError or ProductError.
+    """
+    options = {} if weight_fwhm is None else {"weight_fwhm": weight_fwhm}
     if isinstance(stars, (str, Path)):
-        return FocalPlaneStars.read(stars)
-    return FocalPlaneStars.from_table(stars)
+        return FocalPlaneStars.read(stars, **options)
+    if not isinstance(stars, FocalPlaneStars):
+        return FocalPlaneStars.from_table(stars, **options)
+    # Stars without stamps may leave theirs unstated.
+    stated = stars.stamps is not None or not same_weight(stars.weight_fwhm, FocalPlaneStars.weight_fwhm)
+    if weight_fwhm is not None and stated and not same_weight(weight_fwhm, stars.weight_fwhm):
+        raise DomainError(other_weight(weight_fwhm, stars.weight_fwhm), key="weight_fwhm")
+    return stars
+
+
+def same_weight(one: float, other: float) -> bool:
+    """Return whether two weights of moments are the same, but for rounding."""
+    return math.isclose(one, other, rel_tol=_SAME_WEIGHT)
+
+
+def other_weight(given: float, of_stars: float) -> str:
+    """Return the message of a weight of the moments that is not that of the stars [rad]."""
+    expected = f"expected {of_stars / ARCSEC:.4g}, under which the stars were measured"
+    return f"weight_fwhm = {given / ARCSEC:.4g} arcsec: {expected}"
 
 
 def _concatenated(columns: dict[str, np.ndarray]) -> np.ndarray:

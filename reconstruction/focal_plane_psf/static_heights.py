@@ -12,7 +12,6 @@ about the new heights, and about the wavefront that each exposure had at the las
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,6 +29,7 @@ from ...core.progress import Reporter
 from ...core.result import Result
 from ...core.threads import one_blas_thread
 from ...core.units import ARCSEC
+from ...core.version import VERSION
 from ...models.camera.camera import Camera
 from ...models.camera.cameras import load_camera
 from ...models.camera.ccd_surfaces import CcdSurfaces
@@ -42,7 +42,7 @@ from .heights import STATIC_DEGREE, HeightPrior
 from .mosaic import Mosaic
 from .optics_prior import OpticsPrior
 from .response import Instrument
-from .stars import FocalPlaneStars, places_of, stars_of
+from .stars import FocalPlaneStars, places_of, same_weight, stars_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,8 +50,6 @@ if TYPE_CHECKING:
 
 #: Gauss-Newton steps about the heights of all exposures.
 STEPS = 3
-# Relative difference of weights that are the same.
-_SAME_WEIGHT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,12 +270,12 @@ class _ExposureJob:
     def _under_weight(self, weight_fwhm: float, number: int) -> Instrument:
         """Return the instrument whose shapes are those under the weight of stars [rad]."""
         instrument = self.instrument
-        if math.isclose(weight_fwhm, instrument.weight_fwhm, rel_tol=_SAME_WEIGHT):
+        if same_weight(weight_fwhm, instrument.weight_fwhm):
             return instrument
         if not self.has_weight:
             return replace(instrument, weight_fwhm=weight_fwhm)
         # Tables do not say theirs.
-        if math.isclose(weight_fwhm, FocalPlaneStars.weight_fwhm, rel_tol=_SAME_WEIGHT):
+        if same_weight(weight_fwhm, FocalPlaneStars.weight_fwhm):
             return instrument
         raise DomainError(
             f"exposures[{number}]: weight_fwhm of its stars is {weight_fwhm / ARCSEC:.4g} arcsec: expected that of the "
@@ -290,7 +288,7 @@ class _ExposureJob:
         terms = self.prior.common_terms(places), self.prior.ccd_polynomials(places)
         for array in (data.values, data.noise, places.xy, places.ccd, self.heights, mean, *terms):
             digest.update(np.ascontiguousarray(array).tobytes())
-        digest.update(repr((self.alignment_rms, instrument.key)).encode())
+        digest.update(repr((VERSION, self.alignment_rms, instrument.key)).encode())
         if state is not None:
             digest.update(state.exposure.tobytes())
         return digest.hexdigest()

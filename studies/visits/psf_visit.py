@@ -179,7 +179,7 @@ def visit_psfs(
         width = effective_fwhm(true, observed_psfs.pixel_scale)
         dimmed = stars.magnitude - 2.5 * np.log10(observed_psfs.lit_fraction)
         snr = signal_to_noise(dimmed, stars.band, config.atmosphere.exposure_s, width)
-        return result, model_stars(experiment, observation, stars, snr)
+        return result, model_stars(experiment, observation, stars, counts, snr)
 
     def modelled(exposures: Sequence[CcdExposure]) -> list[_CcdResult | PachonError]:
         ccds = [attempt(observed, exposure) for exposure in exposures]

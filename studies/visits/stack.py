@@ -122,10 +122,14 @@ class PsfStack(Result):
         Visits that saw the point.
     true, model : ndarray of float32, shape [n, size, size]
         Mean PSFs along the axes of the stack, of unit sum.
-    e1, e2, size : ndarray, shape [n]
-        Ellipticity and weighted rms size [rad] of the true PSF, along the axes of the stack.
-    model_e1, model_e2, model_size : ndarray, shape [n]
-        Those of the model.
+    e1, e2 : ndarray, shape [n]
+        Ellipticity of the true PSF, along the axes of the stack.
+    size : ndarray, shape [n]
+        Weighted rms size of the true PSF [rad].
+    model_e1, model_e2 : ndarray, shape [n]
+        Ellipticity of the model, along the axes of the stack.
+    model_size : ndarray, shape [n]
+        Weighted rms size of the model [rad].
     """
 
     _table = ("xi", "eta", "star", "count", "e1", "e2", "size", "model_e1", "model_e2", "model_size",

@@ -4,12 +4,15 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import pachon
 from pachon.core.file_lock import file_lock
+from pachon.core.kernel_modules import kernels_by_module
+from pachon.core.stability import PACKAGES
 from pachon.wavefront.pupil_optics import trace_pupils
 
 FIELDS = np.radians(np.stack(np.meshgrid(np.linspace(-1, 1, 8), np.linspace(-1, 1, 8)), axis=-1).reshape(-1, 2))
@@ -76,3 +79,12 @@ def test_without_a_place_for_a_lock_work_goes_on(tmp_path):
     (tmp_path / "file").write_text("")
     with file_lock(tmp_path / "file" / "kernels.lock"):
         pass
+
+
+def test_files_of_kernels_are_warmed_up():
+    names = {name.removesuffix("_plain").removesuffix("_special") for name in kernels_by_module()}
+    root = Path(pachon.core.__file__).parent.parent
+    files = [path for folder in ("core", *PACKAGES) for path in (root / folder).rglob("*_kernels.py")]
+    files = [path for path in files if "@wp.kernel" in path.read_text()]
+    # Models of the PSF wait for those of core at their first evaluation.
+    assert {".".join(("pachon", *path.relative_to(root).with_suffix("").parts)) for path in files} <= names

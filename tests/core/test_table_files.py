@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.io import fits
 from astropy.table import Column, MaskedColumn, QTable, Table
 
 from pachon.core.errors import ConfigError
@@ -76,3 +77,20 @@ def test_names_that_units_would_change_are_kept(tmp_path):
     headings = ("mag [g]", "mag [r]", "flux [1]", "x", "x [deg]", "[m]", "a [no such unit]")
     path.write_text(",".join(headings) + "\n" + ",".join("1234567") + "\n")
     assert tuple(read_columns(path)) == headings
+
+
+def test_fits_has_texts_beyond_ascii_as_escapes(tmp_path):
+    """Names of surfaces ended in a traceback, whatever else there was to write."""
+    path = tmp_path / "t.fits"
+    table = QTable({"name": ["Möbius", "望", "M3"], "ärea": [1.0, 2.0, 3.0] * u.m**2}, meta={"telescope": "Téléscope"})
+    table["name"].info.description, before = "Größe", table.copy()
+    image = {"map": (np.ones((2, 2)), "m", "Bild von Ω")}
+    write_table(path, table, image, [("TELESCOP", "Téléscope", "name")])
+    read = QTable.read(path)
+    assert list(read["name"]) == [r"M\xf6bius", r"\u671b", "M3"]
+    assert read["name"].info.description == r"Gr\xf6\xdfe"
+    assert (read["_xe4rea"] == table["ärea"]).all()
+    assert read.meta["TELESCOPE" if "TELESCOPE" in read.meta else "telescope"] == r"T\xe9l\xe9scope"
+    assert fits.getheader(path, "map")["TELESCOP"] == r"T\xe9l\xe9scope"
+    assert (table == before).all()
+    assert table.meta == before.meta

@@ -116,8 +116,9 @@ def test_what_does_not_fit_together_is_said_in_one_line(options, parts):
         assert part in message
 
 
-def test_screens_that_cannot_hold_the_cutoff_name_the_section():
-    with pytest.raises(ConfigError, match=r"^atmosphere: "):
+def test_screens_that_are_too_coarse_name_key_and_remedy():
+    """Before the cut-off that they cannot hold, which no key sets."""
+    with pytest.raises(ConfigError, match=r"^atmosphere\.screen_size = 64: expected at least 623, "):
         Experiment.from_config(with_options(Configuration(), atmosphere__screen_size=64))
 
 

@@ -39,6 +39,12 @@ def test_stamps_are_those_of_galsim(tmp_path, sampling):
         np.testing.assert_allclose(model.at([place])[0], image / image.sum(), atol=1e-5 * image.max())
 
 
+@pytest.mark.parametrize("kind", ["", "WIN", "PSF", "PEAK"])
+def test_positions_of_each_kind_are_taken_along_both_axes(tmp_path, kind):
+    names = {f"POLNAME{i}": f"{axis}{kind}_IMAGE" for i, axis in ((1, "X"), (2, "Y"))}
+    assert pachon.reconstruction.load_psfex(write_model(tmp_path / "a.psf", **names)).order == 2
+
+
 @pytest.mark.parametrize(
     ("cards", "text"),
     [

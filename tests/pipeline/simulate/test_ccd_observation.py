@@ -11,6 +11,7 @@ from pachon.measure.star_selection import StarFlag
 from pachon.pipeline.config import ReconstructionConfig, with_options
 from pachon.pipeline.defaults import with_paper_model
 from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.simulate import ccd_model
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd, expose_centered
 from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.pipeline.simulate.ccd_observation import observe_ccd
@@ -141,6 +142,21 @@ def test_the_configuration_chooses_the_model(experiment, exposure, plain, option
     # Another description of the same stars is about as good.
     assert np.isfinite(product.observed.leave_one_out_e1).all()
     assert np.std(product.holdout.residual_e1) < 3.0 * np.std(plain.holdout.residual_e1)
+
+
+def test_kriging_has_the_noise_of_the_light_that_arrives(experiment, exposure, monkeypatch):
+    """It had that of stars which nothing vignettes."""
+    fit, fitted = ccd_model.fit_ccd_models, []
+
+    def recorded(experiment, ccds, **options):
+        fitted.extend(ccds)
+        return fit(experiment, ccds, **options)
+
+    monkeypatch.setattr(ccd_model, "fit_ccd_models", recorded)
+    vignetted = dataclasses.replace(exposure.observed, lit_fraction=np.linspace(0.2, 0.9, N))
+    kriged = configured(experiment, reconstruction__interpolation="kriging")
+    stars = model_ccd(kriged, dataclasses.replace(exposure, observed=vignetted)).observed
+    np.testing.assert_allclose(fitted[0].stamps.sum(axis=(1, 2)), stars.electrons[stars.used], rtol=1e-12)
 
 
 def test_weights_are_between_equal_and_inverse_variance():

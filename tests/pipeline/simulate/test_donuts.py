@@ -4,9 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError
+from pachon.pipeline.simulate.donut_file import DonutScene, SimulatedDonuts, simulate_donuts, write_donuts
+from pachon.sensing.model import DonutModel
+from pachon.sensing.stamp_headers import header_values
 
 LSST = pachon.load_telescope("lsst_v3.3_r").perturbed("Detector", shift=(0.0, 0.0, 0.3e-3))
 FIELDS = np.deg2rad([(0.2, 0.1), (-0.7, 0.9), (1.0, 1.2)])
@@ -113,3 +117,28 @@ def test_one_model_draws_and_fits():
 def test_models_of_several_exposures_are_refused(changes, text):
     with pytest.raises((DomainError, ConfigError), match=text):
         pachon.draw_donuts(LSST, FIELDS[:2], 620e-9, model=pachon.DonutModel(**changes))
+
+
+def test_a_file_of_donuts_has_the_telescope_of_any_name(tmp_path):
+    """Names beyond ASCII ended in a traceback when all donuts were drawn."""
+    path, name, bodies = tmp_path / "donuts.fits", "C:\\télescope/Ωμέγα_望遠鏡.yaml", "Caméra"
+    numbers = np.zeros((2, 2)), np.full(2, 1.5e-3), np.zeros((2, 19))
+    donuts = SimulatedDonuts(np.ones((2, 5, 5), dtype=np.float32), *numbers, 620e-9)
+    model = DonutModel(detector=pachon.DonutDetector(defocus=1.5e-3, moved=bodies))
+    write_donuts(path, donuts, DonutScene(), model, name)
+    with fits.open(path) as hdus:
+        assert header_values([hdus[0].header], path).telescope == name
+
+
+@pytest.mark.parametrize(
+    ("scene", "field", "text"),
+    [
+        ({"stars": 3}, None, "stars = 3: expected none with layout = corners"),
+        ({"sides": 2}, None, "sides = 2: expected none with layout = corners"),
+        ({}, np.zeros(2), "layout = corners: expected no field of all stars"),
+    ],
+)
+def test_corners_have_stars_of_their_own(scene, field, text):
+    """Other numbers and places were ignored."""
+    with pytest.raises(ConfigError, match=f"^{text}"):
+        simulate_donuts(LSST, LSST, DonutScene(layout="corners", **scene), DonutModel(), field)

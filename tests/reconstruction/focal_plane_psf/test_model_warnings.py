@@ -1,13 +1,17 @@
 """Remarks and errors of the focal-plane model about stars and telescopes that do not fit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pachon import load_telescope
 from pachon.core.errors import DomainError
+from pachon.core.units import ARCSEC
 from pachon.models.camera.cameras import load_camera
 from pachon.reconstruction.focal_plane_psf import likelihood
 from pachon.reconstruction.focal_plane_psf.model import FocalPlanePsf
+from pachon.reconstruction.focal_plane_psf.mosaic import Mosaic
 from pachon.reconstruction.focal_plane_psf.stars import FocalPlaneStars
 
 
@@ -29,6 +33,26 @@ def stars(camera):
 
 def with_noise(stars, noise):
     return FocalPlaneStars(stars.ccd, stars.x, stars.y, stars.values, noise)
+
+
+def test_stamps_of_other_pixels_than_the_instrument_give_one_clear_line(stars, camera, lsst_r):
+    """Drawn images had the pixels of the instrument, and principal components those of the stamps."""
+    binned = replace(stars, stamps=np.full((60, 15, 15), 1.0 / 225.0), pixel_scale=0.4 * ARCSEC)
+    with pytest.raises(DomainError, match=r"^pixel_scale = 0\.4 arcsec of the stamps: expected 0\.2[^\n]*20 um$"):
+        FocalPlanePsf.fit(binned, lsst_r, camera=camera)
+
+
+@pytest.mark.parametrize(("ccd", "y"), [(["R22_S11", "R22_S12"], [0.0] * 3), ("R22_S11", [0.0] * 2)])
+def test_places_of_other_numbers_of_ccds_give_one_clear_line(camera, ccd, y):
+    with pytest.raises(DomainError, match=r"^x, y, ccd have shapes [^\n]*$"):
+        Mosaic.of_camera(camera).places(ccd, [0.0] * 3, y)
+
+
+def test_stamps_without_a_whole_one_are_as_none(stars, camera):
+    unseen = replace(stars, stamps=np.full((60, 15, 15), np.nan), pixel_scale=0.2 * ARCSEC)
+    model = FocalPlanePsf.fit(unseen, camera=camera)
+    assert model.mean_star is None
+    assert model.used.all()
 
 
 @pytest.mark.long

@@ -1,6 +1,9 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.io import fits
 from astropy.table import MaskedColumn, Table
 
 from pachon.core.errors import DomainError, PachonError, ProductError
@@ -133,6 +136,42 @@ def test_positions_in_pixels():
     np.testing.assert_array_equal(found.x, 100.0 * np.arange(N))
 
 
+@pytest.mark.parametrize("name", ["stars.ecsv", "stars.fits"])
+@pytest.mark.parametrize("pixels", [False, True])
+def test_written_stars_are_read_as_they_were(tmp_path, name, pixels):
+    """Pixels had metres as their unit, and e1 and e2 the radians of sizes; the columns were no others' to read."""
+    given = replace(FocalPlaneStars.from_table(COLUMNS, weight_fwhm=1.1 * ARCSEC), pixels=pixels)
+    given.write(tmp_path / name)
+    table = Table.read(tmp_path / name)
+    assert [str(table[c].unit or "") for c in ("x", "e1", "size", "size_noise")] == [
+        "pix" if pixels else "m",
+        "",
+        "rad",
+        "",
+    ]
+    read = FocalPlaneStars.read(tmp_path / name)
+    assert (read.ccd, read.pixels) == (given.ccd, pixels)
+    assert read.weight_fwhm == pytest.approx(given.weight_fwhm, rel=1e-8)
+    for key in ("x", "y", "values", "noise"):
+        np.testing.assert_allclose(getattr(read, key), getattr(given, key), rtol=1e-15)
+
+
+def test_another_weight_than_that_of_the_stars_gives_one_clear_line(tmp_path):
+    """Shapes under the one were taken for those under the other: sizes were wrong by a fifth."""
+    line = r"weight_fwhm = 1\.2 arcsec: expected 0\.7, under which the stars were measured$"
+    table = without("e1") | {"snr": np.full(N, 100.0), "stamp": STAMPS}
+    stars = FocalPlaneStars.from_table(table, pixel_scale=PIXEL)
+    with pytest.raises(DomainError, match=f"^{line}"):
+        FocalPlanePsf.fit(stars, camera="lsst", weight_fwhm=1.2 * ARCSEC)
+    with pytest.raises(DomainError, match=r"^weight_fwhm = 1\.2 arcsec: expected 0\.9, "):
+        stars_of(replace(stars, stamps=None, weight_fwhm=0.9 * ARCSEC), 1.2 * ARCSEC)
+    # Tables of shapes need not say theirs.
+    assert stars_of(COLUMNS, 1.2 * ARCSEC).weight_fwhm == pytest.approx(1.2 * ARCSEC)
+    fits.PrimaryHDU(header=fits.Header({"WFWHM": 0.7})).writeto(tmp_path / "ccd_A.fits")
+    with pytest.raises(ProductError, match=rf"ccd_A\.fits: {line}"):
+        FocalPlaneStars.read(tmp_path, weight_fwhm=1.2 * u.arcsec)
+
+
 def test_stamps_are_measured_and_scaled_to_unit_sum():
     columns = {k: COLUMNS[k] for k in ("ccd", "x", "y")} | {"snr": np.full(N, 100.0)}
     stamps = np.stack([(1.0 + i) * star() for i in range(N)])
@@ -188,6 +227,9 @@ STAMPS = np.broadcast_to(star(), (N, SIZE, SIZE))
         (COLUMNS | {"y": np.zeros((N, 2))}, {}, ["y", str((N, 2))]),
         (COLUMNS, {"stamps": STAMPS}, ["pixel_scale"]),
         (COLUMNS, {"stamps": STAMPS[:5], "pixel_scale": PIXEL}, ["5", "12"]),
+        (COLUMNS, {"stamps": STAMPS.reshape(N, -1), "pixel_scale": PIXEL}, ["stamps", str((N, SIZE * SIZE))]),
+        (COLUMNS, {"stamps": STAMPS[:, :, 1:], "pixel_scale": PIXEL}, ["stamps", str((N, SIZE, SIZE - 1))]),
+        (COLUMNS | {"stamp": ["R22"] * N}, {"pixel_scale": PIXEL}, ["stamps", "numbers"]),
         ({}, {}, ["ccd"]),
         (17, {}, ["int"]),
     ],

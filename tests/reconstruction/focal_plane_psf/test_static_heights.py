@@ -8,6 +8,7 @@ from threadpoolctl import threadpool_limits
 from pachon.core.errors import DomainError, ProductError
 from pachon.core.units import ARCSEC
 from pachon.models.camera.focal_plane import FocalPlane
+from pachon.reconstruction.focal_plane_psf import static_heights
 from pachon.reconstruction.focal_plane_psf.fit import ExposureFit
 from pachon.reconstruction.focal_plane_psf.heights import powers
 from pachon.reconstruction.focal_plane_psf.optics_prior import OpticsPrior
@@ -149,6 +150,17 @@ def test_files_of_another_telescope_are_computed_again(both, fit, exposures, mon
     moved = Instrument.of(lsst_r.perturbed("M2", shift=(1e-3, 0.0, 0.0)), wavelengths)
     with pytest.raises(InterruptedError):
         fit([0, 1], folder=both[1], telescope=moved)
+
+
+@pytest.mark.long
+def test_files_of_another_version_are_computed_again(both, fit, monkeypatch):
+    def never(self):
+        raise InterruptedError
+
+    monkeypatch.setattr(ExposureFit, "linearise", never)
+    monkeypatch.setattr(static_heights, "VERSION", "0.9")
+    with pytest.raises(InterruptedError):
+        fit([0, 1], folder=both[1])
 
 
 @pytest.mark.long

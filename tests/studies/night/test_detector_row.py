@@ -5,13 +5,15 @@ import sys
 
 import numpy as np
 import pytest
-from astropy.table import QTable
+from astropy.table import QTable, Table
 
 import pachon
 from pachon.core.errors import ConfigError
+from pachon.core.units import ARCSEC
 from pachon.models.camera.cameras import load_camera
 from pachon.pipeline.config import configuration_of
 from pachon.pipeline.listed_visit import ground_wind, telescope_of_band, visit_cards, visit_experiment
+from pachon.pipeline.simulate.photometry import limiting_magnitude, saturation_magnitude
 from pachon.sky.visit_list.visit_list import ListedVisit
 from pachon.studies.night import detector_row
 from pachon.studies.night.night_files import write_named_table
@@ -60,6 +62,21 @@ def test_photometry_of_a_visit(experiment):
     variance = sky + 2 * 8.8**2 + 0.2 * 30
     assert columns["skyNoise"] == pytest.approx(math.sqrt(variance))
     assert columns["weight"] == pytest.approx(1 / (variance * 10 ** (0.8 * (31.4 - zero_point))))
+
+
+@pytest.mark.parametrize("given", [{}, {"brightest": 16.0}])
+def test_limits_of_a_catalogue_are_those_of_the_sky_and_snaps(tmp_path, given):
+    """They were those of a dark sky and one snap."""
+    magnitudes = np.linspace(14.0, 26.0, 60)
+    table = Table({"x_m": np.linspace(-0.01, 0.01, 60), "y_m": np.full(60, 0.003), "mag": magnitudes})
+    table.write(tmp_path / "stars.csv")
+    stars = {"catalogue": str(tmp_path / "stars.csv"), **given}
+    of_visit = visit_experiment(configuration_of({"ccds": ["R22_S11"], "stars": stars}, "test"), listed(sky=18.0))
+    width = 0.6 * ARCSEC
+    bright = given.get("brightest", saturation_magnitude(of_visit.band, 30.0, width))
+    faint = limiting_magnitude(30.0, of_visit.band, 30.0, width)
+    expected = magnitudes[(magnitudes >= bright) & (magnitudes <= faint)]
+    np.testing.assert_allclose(np.sort(of_visit.star_list.on("R22_S11")[1]), expected)
 
 
 def test_limiting_magnitude_has_a_signal_to_noise_of_5(experiment):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from pachon.core.docstrings import described
 from pachon.core.products import Stamp
 from pachon.core.units import ARCMIN
 from pachon.studies.visits.stack import PsfStack
@@ -37,6 +38,8 @@ def test_moments_are_carried_to_west_and_north(angle, mirrored, tmp_path):
         round_part, square = 1.0 + abs(one) ** 2, 2.0 * np.array([[one.real, one.imag], [one.imag, -one.real]])
         expected = shape_of(to_sky @ (round_part * np.eye(2) + square) @ to_sky.T)
         assert complex(e1, e2) == pytest.approx(expected, abs=1e-12)
+    units = {"e1": "", "e2": "", "size": "rad", "model_e1": "", "model_e2": "", "model_size": "rad"}
+    assert {name: described(PsfStack, name).unit for name in units} == units
     stack.write_product(tmp_path / "stack.fits", Stamp("0", 1))
     table = fits.getdata(tmp_path / "stack.fits", "POINTS")
     assert np.array_equal(table["E1_SKY"], stack.e1_sky)
