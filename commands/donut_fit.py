@@ -81,7 +81,7 @@ class DonutWork:
         header = files.header()
         frames = frame_options.frames(header)
         believed = frames.telescope(_focused(telescope, header, files.paths[0]))
-        inputs = donut_inputs(files, frame_options, frames, believed, stamps.electrons(header), telescope.field())
+        inputs = donut_inputs(files, frame_options, frames, believed, stamps.electrons(), telescope.field())
         model = DonutModel(
             air=fit.air(believed, telescope.outer_scale_m),
             detector=DonutDetector(

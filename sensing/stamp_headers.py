@@ -122,7 +122,7 @@ def header_values(headers: Iterable[fits.Header], file: Path) -> HeaderValues:
         if rotation is not None:
             # Images' +y has the position angle q - rotator - 90 deg.
             rotator = float(np.remainder(parallactic - rotation - 0.5 * np.pi + np.pi, 2.0 * np.pi) - np.pi)
-    gain = next((g for h in listed if (g := _gain(h, file)) is not None), None)
+    gain = next((g for h in listed if (g := gain_of(h, file)) is not None), None)
     simulated = next((h for h in listed if TELESCOPE_KEY in h), None)
     if simulated is None:
         return HeaderValues(camera, rotator, parallactic, band, wavelength, gain)
@@ -267,8 +267,8 @@ def _band(header: fits.Header) -> tuple[str | None, float | None]:
     return None, None
 
 
-def _gain(header: fits.Header, file: Path) -> float | None:
-    """Return electrons of a unit; 1 for images in electrons."""
+def gain_of(header: fits.Header, file: Path) -> float | None:
+    """Return electrons of a unit of an image, 1 for one in electrons; None where its header does not say."""
     if str(header.get("BUNIT", "")).strip().lower() in ("electron", "electrons", "e-", "e"):
         return 1.0
     keys = [key for key in ("GAIN", "GAINA", "GAINB") if key in header]

@@ -14,9 +14,10 @@ from scipy.ndimage import gaussian_filter
 
 import pachon
 from pachon.commands.cli import app, main
-from pachon.commands.donut_inputs import StampFiles
-from pachon.commands.donut_options import SimulationOptions, TelescopeOptions
+from pachon.commands.donut_inputs import StampFiles, donut_inputs
+from pachon.commands.donut_options import FrameOptions, SimulationOptions, TelescopeOptions
 from pachon.commands.donut_report import motion_rows
+from pachon.core.errors import ProductError
 from pachon.sensing.observatory_zernikes import BodyMotions
 from pachon.sensing.stamp_files import read_stamps
 
@@ -316,6 +317,33 @@ def test_stamps_turned_by_half_are_not_taken_for_the_other_side_alone(tmp_path, 
     captured = capsys.readouterr()
     assert "defocus sign, orientation" in captured.out
     assert "try --stamp-axes=-x,-y, unless the defocus has the wrong sign" in captured.err
+
+
+def lsst_exposures(folder, parallactic_angles, gains):
+    """Files of a stamp each, at one rotation of the sky."""
+    paths = [folder / f"{k}.fits" for k in range(len(parallactic_angles))]
+    for path, angle, gain in zip(paths, parallactic_angles, gains, strict=True):
+        header = fits.Header({"CAM_NAME": "LSSTCam", "BANDPASS": "r", "GAIN": gain, "FIELD_X": 0.0, "FIELD_Y": 0.0})
+        header["HIERARCH BORESIGHT_ROT_ANGLE_RAD"], header["HIERARCH BORESIGHT_PAR_ANGLE_RAD"] = 0.5, angle
+        fits.PrimaryHDU(np.ones((16, 16)), header).writeto(path)
+    return StampFiles.read(paths, None, 180, None, None)
+
+
+def test_two_exposures_in_a_row_have_rotators_that_differ_a_little(tmp_path):
+    """Exposures on both sides of focus, 40 s apart, were refused: the rotator follows the sky, here through south."""
+    half_a_turn = np.pi
+    files = lsst_exposures(tmp_path, [half_a_turn - 2e-3, -half_a_turn + 3e-3], [1.5, 3.0])
+    assert files.header().parallactic_angle == pytest.approx(half_a_turn - 2e-3)
+    tel = pachon.load_telescope("lsst_v3.3_r")
+    inputs = donut_inputs(files, FrameOptions(), pachon.sensing.DonutFrames(), tel, None, None)
+    # Each has the gain of its own header.
+    assert [image.max() for image in inputs.images] == [1.5, 3.0]
+
+
+def test_exposures_of_different_rotators_are_refused(tmp_path):
+    files = lsst_exposures(tmp_path, [0.3, 0.35], [1.0, 1.0])
+    with pytest.raises(ProductError, match="give files of one pointing"):
+        files.header()
 
 
 @pytest.mark.parametrize(
