@@ -143,6 +143,11 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
         (["plain.fits", "--stamp-axes", "x,x"], "--stamp-axes = 'x,x': expected DVCS, CCS, or axes"),
         (["plain.fits", "--rotator-deg", "nan"], "--rotator-deg = nan: expected a finite number of degrees"),
         (["plain.fits", "--frame", "sky"], "frame sky without a parallactic angle: expected --parallactic-deg"),
+        # Only after the fit, whose results were lost.
+        (
+            ["plain.fits", "--zernikes", "14", "--frame", "CCS", "--rotator-deg", "20", "--field-deg", "0,0"],
+            "--zernikes = 14, --frame = CCS: Z14 mixes with its partner of the same order in this frame: expected both",
+        ),
         (["plain.fits", "--gain", "0", "--field-deg", "0,0"], "--gain = 0.0: expected electrons of a unit, above 0"),
         (["plain.fits", "--mask", "rows.fits", "--field-deg", "0,0"], "1 of shape [3, 16, 16] for 1 image of [2, 16"),
         (["plain.fits", "plain.fits", "--mask", "plain.fits"], "for 2 files: expected one file of stamps with it"),
