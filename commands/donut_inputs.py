@@ -168,11 +168,14 @@ def donut_inputs(
                 matrix = stamp_matrix(frames.stamp_axes)
             else:
                 matrix = places.axes[k]
-            electrons = stamps.gains[k] or stamps.header.gain or 1.0 if gain is None else gain
+            stated = (stamps.gains[k] or stamps.header.gain or 1.0) if gain is None else gain
+            # Of images in another unit the variance says nothing of the light's own noise: all of it is measured.
+            is_known = bool(np.isfinite(stated))
+            electrons = stated if is_known else 1.0
             images.append(along_camera(electrons * image, matrix))
             masks.append(along_camera(mask, matrix))
             axes.append(matrix)
-            plane = None if stamps.variances is None else sky_of_variance(stamps.variances[k], mask)
+            plane = None if stamps.variances is None or not is_known else sky_of_variance(stamps.variances[k], mask)
             variances.append(None if plane is None else electrons**2 * plane)
     return DonutInputs(
         images, masks, np.concatenate(fields), np.concatenate(defocus), np.concatenate(heights), variances, axes

@@ -80,7 +80,7 @@ class DonutStamps:
     moved : str, optional
         Surface or group that moves, of all stamps; None where the file does not name it.
     gains : list of float or None
-        Electrons of a unit of each image; None where its header does not say.
+        Electrons of a unit of each image; None where its header does not say, NaN for another unit without a gain.
     """
 
     images: list[np.ndarray]
@@ -220,7 +220,7 @@ def _cut_stamps(
         pixels=middles,
         has_defocus=np.isfinite(shifts),
         header=values,
-        gains=[values.gain] * len(centers),
+        gains=[gain_of(image.header, path)] * len(centers),
     )
 
 

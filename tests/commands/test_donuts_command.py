@@ -345,6 +345,26 @@ def test_two_exposures_in_a_row_have_rotators_that_differ_a_little(tmp_path):
     assert [image.max() for image in inputs.images] == [1.5, 3.0]
 
 
+@pytest.mark.parametrize(
+    ("cards", "gain", "expected"),
+    [
+        ({"BUNIT": "nJy"}, None, None),  # was taken for electrons
+        ({"BUNIT": "adu"}, 2.0, 36.0),
+        ({"BUNIT": "adu", "GAIN": 3.0}, None, 81.0),
+        ({"BUNIT": "electron"}, None, 9.0),
+        ({}, None, 9.0),
+    ],
+)
+def test_variances_count_where_electrons_are_known(tmp_path, cards, gain, expected):
+    """Photon noise is that of electrons: with variances in nJy, 30 to an electron, errors were a sixth too small."""
+    primary = fits.PrimaryHDU(np.ones((16, 16)), fits.Header({"FIELD_X": 0.0, "FIELD_Y": 0.0, **cards}))
+    plane = fits.ImageHDU(np.full((16, 16), 9.0), name="VARIANCE")
+    fits.HDUList([primary, plane]).writeto(tmp_path / "a.fits")
+    files, tel = StampFiles.read([tmp_path / "a.fits"], None, 180, None, None), pachon.load_telescope("lsst_v3.3_r")
+    inputs = donut_inputs(files, FrameOptions(), pachon.sensing.DonutFrames(), tel, gain, None)
+    assert inputs.variances == [expected]
+
+
 def test_exposures_of_different_rotators_are_refused(tmp_path):
     files = lsst_exposures(tmp_path, [0.3, 0.35], [1.0, 1.0])
     with pytest.raises(ProductError, match="give files of one pointing"):
