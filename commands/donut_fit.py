@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..core.errors import PachonError, ProductError
+from ..core.errors import ConfigError, DomainError, PachonError, ProductError
 from .donut_inputs import DonutInputs, StampFiles, donut_inputs
 from .donut_options import DEFAULT_TELESCOPE
 from .options import wavelength_list
@@ -80,8 +80,9 @@ class DonutWork:
         files = StampFiles.read(telescope.files, stamps.positions, stamps.stamp, stamps.mask, stamps.variance)
         header = files.header()
         frames = frame_options.frames(header)
+        _require_partners(fit.noll, frames, frame_options)
         believed = frames.telescope(_focused(telescope, header, files.paths[0]))
-        inputs = donut_inputs(files, frame_options, frames, believed, stamps.electrons(header), telescope.field())
+        inputs = donut_inputs(files, frame_options, frames, believed, stamps.electrons(), telescope.field())
         model = DonutModel(
             air=fit.air(believed, telescope.outer_scale_m),
             detector=DonutDetector(
@@ -181,6 +182,16 @@ def _focused(options: TelescopeOptions, header: HeaderValues, file: Path) -> Tel
             raise
         text = f"{TELESCOPE_KEY} = {header.telescope!r}: {error}; give the telescope by --telescope"
         raise ProductError(text, file=file, key=TELESCOPE_KEY) from None
+
+
+def _require_partners(noll: Sequence[int], frames: DonutFrames, options: FrameOptions) -> None:
+    """Raise ConfigError, before a fit, for a last Zernike whose partner the frame of the results asks for."""
+    from ..sensing.frames import zernike_matrix
+
+    try:
+        zernike_matrix(noll, frames.axes(options.names[1])[:2, :2])
+    except DomainError as error:
+        raise ConfigError(f"--zernikes = {noll[-1]}, --frame = {options.frame}: {error}") from None
 
 
 def _unknowns(options: FitOptions, count: int) -> WavefrontFit:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import remainder, tau
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
 _MOVED = {"lsst": "Camera", "comcam": "Camera", "auxtel": "M2", "decam": "DECam"}
 #: Names of detectors that stand out of focus themselves: LSST's corner sensors and DECam's focus chips.
 _OUT_OF_FOCUS = re.compile(r"\w+_SW\d|F[NS]\d")
-#: Difference of angles of one exposure that is rounding of its headers [rad].
-_SAME_ANGLE = 1e-3
+#: Difference of angles of two exposures in a row, on both sides of focus: a rotator follows the sky. 1.1 degrees take
+#: 4 % of an astigmatism for the other one [rad].
+_SAME_ANGLE = 0.02
 
 
 @dataclass(frozen=True)
@@ -73,13 +75,13 @@ class StampFiles:
             header = stamps.header
             angles = [(v.rotator, v.parallactic_angle) for v in (first, header)]
             same = all(
-                (a is None) == (b is None) and (a is None or b is None or abs(a - b) < _SAME_ANGLE)
+                (a is None) == (b is None) and (a is None or b is None or abs(remainder(a - b, tau)) < _SAME_ANGLE)
                 for a, b in zip(*angles, strict=True)
             )
             instrument = [(h.camera, h.band, h.telescope, h.pixel) for h in (first, header)]
             if instrument[0] != instrument[1] or not same:
                 text = f"{header.text or 'no header'}: expected that of {self.paths[0]}, {first.text or 'no header'}"
-                raise ProductError(f"{text}; give files of one exposure", file=path)
+                raise ProductError(f"{text}; give files of one pointing", file=path)
             if not (first.wavelength is None or np.isclose(first.wavelength, header.wavelength or 0.0)):
                 raise ProductError("filter: expected that of the other files", file=path)
         return first
@@ -132,12 +134,12 @@ def donut_inputs(
     options: FrameOptions,
     frames: DonutFrames,
     telescope: Telescope,
-    gain: float,
+    gain: float | None,
     field: np.ndarray | None,
 ) -> DonutInputs:
     """Return the stamps of files for a telescope with its camera at the angle of the rotator.
 
-    Files without field angles have one that is given [rad].
+    Files without field angles have one that is given [rad]; gains are those of the images' headers unless one is given.
     """
     import numpy as np
 
@@ -166,11 +168,15 @@ def donut_inputs(
                 matrix = stamp_matrix(frames.stamp_axes)
             else:
                 matrix = places.axes[k]
-            images.append(along_camera(gain * image, matrix))
+            stated = (stamps.gains[k] or stamps.header.gain or 1.0) if gain is None else gain
+            # Of images in another unit the variance says nothing of the light's own noise: all of it is measured.
+            is_known = bool(np.isfinite(stated))
+            electrons = stated if is_known else 1.0
+            images.append(along_camera(electrons * image, matrix))
             masks.append(along_camera(mask, matrix))
             axes.append(matrix)
-            plane = None if stamps.variances is None else sky_of_variance(stamps.variances[k], mask)
-            variances.append(None if plane is None else gain**2 * plane)
+            plane = None if stamps.variances is None or not is_known else sky_of_variance(stamps.variances[k], mask)
+            variances.append(None if plane is None else electrons**2 * plane)
     return DonutInputs(
         images, masks, np.concatenate(fields), np.concatenate(defocus), np.concatenate(heights), variances, axes
     )

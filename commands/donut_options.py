@@ -158,11 +158,9 @@ class StampOptions:
         Option(help="Electrons per unit of the images; GAIN of the header, or 1.", rich_help_panel=_FILES),
     ] = None
 
-    def electrons(self, header: HeaderValues) -> float:
-        """Return electrons of a unit of the images: of the option, the header, or 1."""
-        if self.gain is None:
-            return 1.0 if header.gain is None else header.gain
-        if not (isfinite(self.gain) and self.gain > 0.0):
+    def electrons(self) -> float | None:
+        """Return electrons of a unit of the images of the option; None for those of the headers, or 1."""
+        if self.gain is not None and not (isfinite(self.gain) and self.gain > 0.0):
             raise ConfigError(f"--gain = {self.gain}: expected electrons of a unit, above 0")
         return self.gain
 

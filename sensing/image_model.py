@@ -36,6 +36,8 @@ MOST_NEIGHBOURS = 5
 FLUX, X, Y, BACKGROUND, STRENGTH, SLOPE_X, SLOPE_Y, RATIO = range(8)
 #: Power of the strength of the turbulence that the exponent of its transfer function goes by.
 EXPONENT_GROWTH = 5.0 / 3.0
+#: Least margin of the grid beside the stamp, in which blurred light does not wrap around [pixels of the fit].
+_LEAST_MARGIN = 8
 #: Step of the difference that the core follows its variance by, over it, and the least one [pixels^2].
 _WIDER = 2e-2
 _LEAST_WIDER = 1e-3
@@ -118,8 +120,10 @@ class ImageGrid:
         self.shape, self.pixel, self.footprint = shape, pixel, footprint
         #: Pixels of the detector along one of the stamp, and the centre of its stamp from that of this one [pixels].
         self.scale, self.offset = float(pixels.side), np.array(pixels.offset)
-        self.sharp, self.reach, self.coarse = sharp, reach, pixels.blur > 0.0
-        margin = max(8, math.ceil(reach / pixel))
+        self.sharp, self.coarse = sharp, pixels.blur > 0.0
+        margin = max(_LEAST_MARGIN, math.ceil(reach / pixel))
+        #: Distance from the stamp within which light does not wrap around [m].
+        self.reach = margin * pixel
         self._size = tuple(fft.next_fast_len(n + margin, real=True) for n in shape)
         #: Place of the centre of the stamp on the grid, (y, x) cells.
         self._middle = [0.5 * (n - 1) for n in shape]

@@ -27,7 +27,16 @@ from ..core.fits_files import open_fits
 from ..core.number_text import counted
 from ..core.table_files import text_table
 from .inputs import SMALLEST_STAMP
-from .stamp_headers import HeaderValues, corner_of, defocus_of, detector_of, header_values, pixel_of, stamp_header
+from .stamp_headers import (
+    HeaderValues,
+    corner_of,
+    defocus_of,
+    detector_of,
+    gain_of,
+    header_values,
+    pixel_of,
+    stamp_header,
+)
 
 #: Kinds of planes that go with images, by the names of their extensions without numbers.
 _PLANES = {
@@ -70,6 +79,8 @@ class DonutStamps:
         What its headers say of the exposure.
     moved : str, optional
         Surface or group that moves, of all stamps; None where the file does not name it.
+    gains : list of float or None
+        Electrons of a unit of each image; None where its header does not say, NaN for another unit without a gain.
     """
 
     images: list[np.ndarray]
@@ -82,6 +93,7 @@ class DonutStamps:
     has_defocus: np.ndarray
     header: HeaderValues = field(default_factory=HeaderValues)
     moved: str | None = None
+    gains: list[float | None] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.images)
@@ -173,6 +185,7 @@ def _stamps_of(
         has_defocus=np.isfinite(shifts),
         header=values,
         moved=moved,
+        gains=[gain_of(i.header, path) for i in single],
     )
 
 
@@ -207,6 +220,7 @@ def _cut_stamps(
         pixels=middles,
         has_defocus=np.isfinite(shifts),
         header=values,
+        gains=[gain_of(image.header, path)] * len(centers),
     )
 
 
@@ -271,8 +285,12 @@ def _with_planes(
             own_variance = np.where(weight > 0.0, 1.0 / np.where(weight > 0.0, weight, 1.0), np.nan)
         elif planes["deviation"]:
             own_variance = np.asarray(planes["deviation"][k][1], dtype=np.float64) ** 2
-        if own_variance is not None:
-            own_mask = own_mask | ~(np.isfinite(own_variance) & (own_variance > 0.0))
+        known = None if own_variance is None else np.isfinite(own_variance) & (own_variance > 0.0)
+        if known is not None and known.any():
+            own_mask = own_mask | ~known
+        else:
+            # A plane of zeros, as ts_wep writes it without variances, says nothing.
+            own_variance = None
         merged = stamp_header(primary, header, k) if header is not primary else header
         out.append(_Image(np.asarray(data, dtype=np.float64), own_mask, own_variance, merged))
     return out

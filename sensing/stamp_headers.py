@@ -123,7 +123,7 @@ def header_values(headers: Iterable[fits.Header], file: Path) -> HeaderValues:
         if rotation is not None:
             # Images' +y has the position angle q - rotator - 90 deg.
             rotator = float(np.remainder(parallactic - rotation - 0.5 * np.pi + np.pi, 2.0 * np.pi) - np.pi)
-    gain = next((g for h in listed if (g := _gain(h, file)) is not None), None)
+    gain = next((g for h in listed if (g := gain_of(h, file)) is not None and np.isfinite(g)), None)
     simulated = next((h for h in listed if TELESCOPE_KEY in h), None)
     if simulated is None:
         return HeaderValues(camera, rotator, parallactic, band, wavelength, gain)
@@ -268,16 +268,20 @@ def _band(header: fits.Header) -> tuple[str | None, float | None]:
     return None, None
 
 
-def _gain(header: fits.Header, file: Path) -> float | None:
-    """Return electrons of a unit; 1 for images in electrons."""
-    if str(header.get("BUNIT", "")).strip().lower() in ("electron", "electrons", "e-", "e"):
+def gain_of(header: fits.Header, file: Path) -> float | None:
+    """Return electrons of a unit of an image, 1 for one in electrons; None where its header does not say.
+
+    NaN for an image that is said to be in another unit, without a gain.
+    """
+    unit = str(header.get("BUNIT", "")).strip().lower()
+    if unit in ("electron", "electrons", "e-", "e"):
         return 1.0
     keys = [key for key in ("GAIN", "GAINA", "GAINB") if key in header]
     values = [_number(header, key, file) for key in keys[:1] if key == "GAIN"] or [
         _number(header, key, file) for key in keys
     ]
     if not values:
-        return None
+        return float("nan") if unit else None
     gain = float(np.mean(values))
     if not (np.isfinite(gain) and gain > 0.0):
         raise ProductError(f"{keys[0]} = {header[keys[0]]!r}: expected electrons of a unit, above 0", file=file)

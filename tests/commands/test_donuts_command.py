@@ -14,9 +14,10 @@ from scipy.ndimage import gaussian_filter
 
 import pachon
 from pachon.commands.cli import app, main
-from pachon.commands.donut_inputs import StampFiles
-from pachon.commands.donut_options import SimulationOptions, TelescopeOptions
+from pachon.commands.donut_inputs import StampFiles, donut_inputs
+from pachon.commands.donut_options import FrameOptions, SimulationOptions, TelescopeOptions
 from pachon.commands.donut_report import motion_rows
+from pachon.core.errors import ProductError
 from pachon.sensing.observatory_zernikes import BodyMotions
 from pachon.sensing.stamp_files import read_stamps
 
@@ -142,6 +143,11 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
         (["plain.fits", "--stamp-axes", "x,x"], "--stamp-axes = 'x,x': expected DVCS, CCS, or axes"),
         (["plain.fits", "--rotator-deg", "nan"], "--rotator-deg = nan: expected a finite number of degrees"),
         (["plain.fits", "--frame", "sky"], "frame sky without a parallactic angle: expected --parallactic-deg"),
+        # Only after the fit, whose results were lost.
+        (
+            ["plain.fits", "--zernikes", "14", "--frame", "CCS", "--rotator-deg", "20", "--field-deg", "0,0"],
+            "--zernikes = 14, --frame = CCS: Z14 mixes with its partner of the same order in this frame: expected both",
+        ),
         (["plain.fits", "--gain", "0", "--field-deg", "0,0"], "--gain = 0.0: expected electrons of a unit, above 0"),
         (["plain.fits", "--mask", "rows.fits", "--field-deg", "0,0"], "1 of shape [3, 16, 16] for 1 image of [2, 16"),
         (["plain.fits", "plain.fits", "--mask", "plain.fits"], "for 2 files: expected one file of stamps with it"),
@@ -329,6 +335,53 @@ def test_stamps_turned_by_half_are_not_taken_for_the_other_side_alone(tmp_path, 
     captured = capsys.readouterr()
     assert "defocus sign, orientation" in captured.out
     assert "try --stamp-axes=-x,-y, unless the defocus has the wrong sign" in captured.err
+
+
+def lsst_exposures(folder, parallactic_angles, gains):
+    """Files of a stamp each, at one rotation of the sky."""
+    paths = [folder / f"{k}.fits" for k in range(len(parallactic_angles))]
+    for path, angle, gain in zip(paths, parallactic_angles, gains, strict=True):
+        header = fits.Header({"CAM_NAME": "LSSTCam", "BANDPASS": "r", "GAIN": gain, "FIELD_X": 0.0, "FIELD_Y": 0.0})
+        header["HIERARCH BORESIGHT_ROT_ANGLE_RAD"], header["HIERARCH BORESIGHT_PAR_ANGLE_RAD"] = 0.5, angle
+        fits.PrimaryHDU(np.ones((16, 16)), header).writeto(path)
+    return StampFiles.read(paths, None, 180, None, None)
+
+
+def test_two_exposures_in_a_row_have_rotators_that_differ_a_little(tmp_path):
+    """Exposures on both sides of focus, 40 s apart, were refused: the rotator follows the sky, here through south."""
+    half_a_turn = np.pi
+    files = lsst_exposures(tmp_path, [half_a_turn - 2e-3, -half_a_turn + 3e-3], [1.5, 3.0])
+    assert files.header().parallactic_angle == pytest.approx(half_a_turn - 2e-3)
+    tel = pachon.load_telescope("lsst_v3.3_r")
+    inputs = donut_inputs(files, FrameOptions(), pachon.sensing.DonutFrames(), tel, None, None)
+    # Each has the gain of its own header.
+    assert [image.max() for image in inputs.images] == [1.5, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("cards", "gain", "expected"),
+    [
+        ({"BUNIT": "nJy"}, None, None),  # was taken for electrons
+        ({"BUNIT": "adu"}, 2.0, 36.0),
+        ({"BUNIT": "adu", "GAIN": 3.0}, None, 81.0),
+        ({"BUNIT": "electron"}, None, 9.0),
+        ({}, None, 9.0),
+    ],
+)
+def test_variances_count_where_electrons_are_known(tmp_path, cards, gain, expected):
+    """Photon noise is that of electrons: with variances in nJy, 30 to an electron, errors were a sixth too small."""
+    primary = fits.PrimaryHDU(np.ones((16, 16)), fits.Header({"FIELD_X": 0.0, "FIELD_Y": 0.0, **cards}))
+    plane = fits.ImageHDU(np.full((16, 16), 9.0), name="VARIANCE")
+    fits.HDUList([primary, plane]).writeto(tmp_path / "a.fits")
+    files, tel = StampFiles.read([tmp_path / "a.fits"], None, 180, None, None), pachon.load_telescope("lsst_v3.3_r")
+    inputs = donut_inputs(files, FrameOptions(), pachon.sensing.DonutFrames(), tel, gain, None)
+    assert inputs.variances == [expected]
+
+
+def test_exposures_of_different_rotators_are_refused(tmp_path):
+    files = lsst_exposures(tmp_path, [0.3, 0.35], [1.0, 1.0])
+    with pytest.raises(ProductError, match="give files of one pointing"):
+        files.header()
 
 
 @pytest.mark.parametrize(

@@ -277,6 +277,24 @@ def test_the_sky_of_stamps_with_masked_edges():
     assert sky_of_variance(variance, np.ones_like(edge)) == 0.0
 
 
+@pytest.mark.parametrize("name", ["VARIANCE", "WGT", "ERR"])
+def test_planes_of_zeros_say_nothing(tmp_path, name):
+    """As ts_wep writes them where it has no variances: all pixels were masked, and all donuts lost."""
+    image = np.arange(400.0).reshape(20, 20)
+    fits.HDUList([fits.PrimaryHDU(image), fits.ImageHDU(0.0 * image, name=name)]).writeto(tmp_path / "a.fits")
+    stamps = read_stamps(tmp_path / "a.fits")
+    assert stamps.variances is None
+    assert not stamps.masks[0].any()
+
+
+def test_each_image_has_its_own_gain(tmp_path):
+    """Stamps of several CCDs: all had that of the first, and so the light of the others was wrong."""
+    cards = {"GAIN": 4.0}, {"GAINA": 3.0, "GAINB": 3.4}, {"BUNIT": "electron"}
+    stamps = [fits.ImageHDU(np.ones((20, 20)), header) for header in map(fits.Header, cards)]
+    fits.HDUList([fits.PrimaryHDU(), *stamps]).writeto(tmp_path / "a.fits")
+    assert read_stamps(tmp_path / "a.fits").gains == pytest.approx([4.0, 3.2, 1.0])
+
+
 def test_positions_of_a_spreadsheet(tmp_path):
     """Semicolons, and the byte order mark of spreadsheets before the name of the first column."""
     image = np.arange(150.0 * 160.0).reshape(150, 160)
