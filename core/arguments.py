@@ -330,7 +330,9 @@ def _union_check(checks: list[_Check], optional: bool) -> _Check:
             try:
                 return arm_check(name, value)
             except _MismatchError as problem:
-                problems.append(problem)
+                # Its traceback would hold this frame, which holds it: a ring that keeps the arrays of all callers until
+                # Python looks for such garbage.
+                problems.append(problem.with_traceback(None))
         # Of a sequence whose elements are wrong, the element is the likelier mistake.
         inner = next((p for p in problems if p.name != name), None)
         several = list(dict.fromkeys(p.expected for p in problems))

@@ -1,7 +1,9 @@
 """Arguments are checked by their annotations: what passes is unchanged, what does not is one line with its name."""
 
+import gc
 import inspect
 import pickle
+import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -241,3 +243,26 @@ def test_unpacked_keywords_are_checked_and_shown_as_parameters():
         _area(2.0, kind="oval")
     with pytest.raises(TypeError, match=r"_area\(\) got an unexpected keyword argument 'height'"):
         _area(2.0, height=1.0)
+
+
+class _Large:
+    """Something large of a caller."""
+
+
+def test_checks_hold_nothing_of_their_callers():
+    """A value that only a later arm of a union takes left a ring of frames, with all that callers had."""
+
+    @check_arguments
+    def either(value: int | str | None = None) -> object:
+        return value
+
+    def caller() -> weakref.ref:
+        large = _Large()
+        either("text")
+        return weakref.ref(large)
+
+    gc.disable()
+    try:
+        assert caller()() is None
+    finally:
+        gc.enable()

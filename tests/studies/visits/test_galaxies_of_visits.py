@@ -86,7 +86,7 @@ def test_galaxies_of_a_catalogue_are_measured_where_and_as_it_says(folder, backw
     xi[0], magnitude[1] = 20.0 * ARCMIN, 30.0
     columns = {"mag": magnitude, "half_light_radius": 0.8, "e1": e1, "e2": e2, "n": 0.5}
     write_catalogue(folder / "own.ecsv", xi, eta, **columns)
-    with_galaxies(folder, catalogue="own.ecsv")
+    with_galaxies(folder, catalogue="own.ecsv", convention="tangent_plane")
     found = null_test(folder, tiles=1, rings=12, execution=Execution(threads=1))[1]
     galaxies = found.galaxies
     assert len(galaxies) == n - 2
