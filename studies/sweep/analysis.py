@@ -229,6 +229,11 @@ def verdict(summary: dict[str, Any]) -> str:
             )
             matters = "matters most for" if len(metrics[metric][key]) > 1 else "is the one parameter of"
             return f"{first} {matters} {metric}, {words} {size:+{form}}{of_unit}{second}.{lost}"
+        low, high = metrics[metric]["range"]
+        if low < high and not (metrics[metric]["largest_change"] or metrics[metric]["rank_correlation"]):
+            # Few points, or parameters that are no numbers.
+            span = f"{metric} goes from {low:.4g} to {high:.4g}{f' {unit}' if unit else ''}"
+            return f"{span} over the {points - failed} computed points, which do not tell why.{lost}"
     return f"No parameter changes a metric over the {points - failed} computed points.{lost}"
 
 

@@ -82,6 +82,10 @@ def sweep_summary(changes, ranks=None, failed=0, span=(0.0, 1.0)):
             "b matters most for fwhm_arcsec, with a rank correlation of -0.90; next is a with +0.10.",
         ),
         (sweep_summary({"a": 0.0, "b": NAN}), "No parameter changes a metric over the 12 computed points."),
+        (
+            sweep_summary({}, span=(0.65, 0.7)),
+            "fwhm_arcsec goes from 0.65 to 0.7 arcsec over the 12 computed points, which do not tell why.",
+        ),
         (sweep_summary({}, span=None), "No metric has a value at any of the 12 computed points."),
     ],
 )

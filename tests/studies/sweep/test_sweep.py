@@ -327,7 +327,7 @@ def test_a_wavelength_is_a_parameter(folder):
     (folder / "small.yaml").write_text(text)
     assert main(["sweep", "small.yaml", "--quiet"]) == 0
     with SweepStore(folder / "small.sweep") as store:
-        blue, red = (result.metrics["fwhm_arcsec"] for result in store.results())
+        blue, red = (result.metrics["effective_fwhm_arcsec"] for result in store.results())
     # Seeing falls as the wavelength to the power -1/5; optics and detector are there too, the outer scale takes more.
     assert 0.9 < red / blue < (690 / 560) ** -0.2
 
