@@ -6,7 +6,8 @@ with its image r, the derivatives A of all else, their prior P, the residuals d 
 Chi-square with a = 1 is lower than with a = 0 where :math:`\hat a > 1/2`.
 
 Where much of the seeing of a fit by rays stands for diffracted light, that fit is no start: donuts of a 1.2 m telescope
-of f/2.5 have 1.8 arcsec for 0.6. Neither is it where images are small. Then fits of both kinds are compared.
+of f/2.5 have 1.8 arcsec for 0.6. Neither is it where images are small, nor does an amount between those of rays and of
+waves decide. Then fits of both kinds are compared.
 """
 
 from __future__ import annotations
@@ -39,6 +40,9 @@ _BEFOREHAND = 2.0 * math.log(10.0)
 #: Part of the strength of the turbulence that stands for diffracted light, from which on derivatives at the seeing of a
 #: fit by rays say nothing of one by waves: LSST, DECam and HSC have 0.1 to 0.23, 1.2 m at f/2.5 0.34 to 0.42.
 _MUCH = 0.3
+#: Amount of diffracted light from which on it is not that of rays: these leave 0, waves 0.97 to 1.6 in 60 donuts, and
+#: 0.34 where AuxTel has 100 nm in terms up to Z22, whose fit by rays is far off.
+_NOT_OF_RAYS = 0.2
 
 
 @dataclass(frozen=True)
@@ -106,7 +110,8 @@ def _waves_fit_better(amplitudes: Sequence[_RimAmplitude]) -> bool | None:
     if sum((2.0 * a.value - 1.0) * a.precision for a in amplitudes) > -_BEFOREHAND:
         return True
     linear = np.mean([a.seeing for a in amplitudes]) < _MUCH
-    return False if linear else None
+    amount = np.average([a.value for a in amplitudes], weights=[a.precision for a in amplitudes])
+    return False if linear and amount < _NOT_OF_RAYS else None
 
 
 def _chi2_fall(rays: StarFit, waves: StarFit) -> float:

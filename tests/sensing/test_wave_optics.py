@@ -9,6 +9,7 @@ from scipy.ndimage import map_coordinates
 
 import pachon
 from pachon.core.errors import ConfigError
+from pachon.core.units import ARCSEC
 from pachon.models.zernike_polynomials import annular_zernikes
 from pachon.pipeline.simulate import donut_file
 from pachon.pipeline.simulate.donut_file import DonutScene, simulate_donuts
@@ -195,3 +196,35 @@ def test_corner_sensors_are_those_of_the_lsst_alone():
     hsc = pachon.load_telescope("hsc")
     with pytest.raises(ConfigError, match="layout = corners: hsc has the camera hsc; expected the LSST's, or random"):
         simulate_donuts(hsc, hsc, DonutScene(layout="corners"), pachon.DonutModel(detector=pachon.DonutDetector(1e-3)))
+
+
+@pytest.mark.long
+def test_an_amount_of_diffracted_light_that_is_neither_of_rays_nor_of_waves_does_not_decide():
+    """With 60 nm in each term up to Z22 a fit by rays, 60 nm wrong, told a third of the diffracted light."""
+    auxtel = pachon.load_telescope("auxtel")
+    z = 60e-9 * np.random.default_rng(3).standard_normal(19)
+    aberration = pachon.wavefront.ResidualWavefront(z, auxtel.pupil_diameter, auxtel.pupil_obscuration)
+    detector = pachon.DonutDetector(defocus=0.8e-3, moved="M2")
+    axis, wavelength = np.zeros((1, 2)), auxtel.default_wavelength
+    air = pachon.DonutAir(fwhm=1.0 * ARCSEC)
+    donuts = pachon.draw_donuts(
+        auxtel,
+        axis,
+        wavelength,
+        model=pachon.DonutModel(air=air, detector=detector),
+        electrons=3e6,
+        sky=36.0,
+        seed=3,
+        stamps=pachon.Stamps(221),
+        aberration=aberration,
+    )
+    fit = pachon.fit_donuts(
+        auxtel,
+        donuts.images,
+        axis,
+        wavelength,
+        sky_variance=donuts.sky_variance,
+        model=pachon.DonutModel(detector=detector),
+    )
+    assert fit.diffraction
+    assert np.linalg.norm(fit.zernikes[0] - z) < 25e-9
