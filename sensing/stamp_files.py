@@ -285,9 +285,9 @@ def _with_planes(
             own_variance = np.where(weight > 0.0, 1.0 / np.where(weight > 0.0, weight, 1.0), np.nan)
         elif planes["deviation"]:
             own_variance = np.asarray(planes["deviation"][k][1], dtype=np.float64) ** 2
-        known = None if own_variance is None else np.isfinite(own_variance) & (own_variance > 0.0)
-        if known is not None and known.any():
-            own_mask = own_mask | ~known
+        noisy = None if own_variance is None else np.isfinite(own_variance) & (own_variance > 0.0)
+        if noisy is not None and noisy.any():
+            own_mask = own_mask | ~noisy
         else:
             # A plane of zeros, as ts_wep writes it without variances, says nothing.
             own_variance = None

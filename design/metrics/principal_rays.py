@@ -263,8 +263,8 @@ def image_axes(request: Request) -> np.ndarray:
     ends = beside.bundles(request.middle, np.zeros((1, 2))).chief_landing().reshape(-1, 2, 2, 2)
     moved = ends[:, 0] - ends[:, 1]
     arrived = np.isfinite(moved).all(axis=(1, 2))
-    left, _, right = np.linalg.svd(np.where(arrived[:, None, None], moved, axes))
-    turned = left @ right
+    image_basis, _, sky_basis = np.linalg.svd(np.where(arrived[:, None, None], moved, axes))
+    turned = image_basis @ sky_basis
     along = (turned * axes).sum(axis=-1, keepdims=True)
     turned = np.where(along < -_ACROSS, -turned, turned)
     # Differences of landing points would turn axes of symmetry by their rounding.

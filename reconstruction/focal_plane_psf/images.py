@@ -149,9 +149,11 @@ class ResidualImages:
         covariances = {k: covariance for k, covariance in fitted.items() if covariance is not None}
         if not covariances:
             return None
-        kept = list(covariances)
-        images = components.reshape(keep, ny, nx)[kept]
-        return cls(mosaic, images, places, coefficients[:, kept], noise[:, kept], tuple(covariances.values()))
+        predicting = list(covariances)
+        images = components.reshape(keep, ny, nx)[predicting]
+        return cls(
+            mosaic, images, places, coefficients[:, predicting], noise[:, predicting], tuple(covariances.values())
+        )
 
     def at(self, places: Places, threads: int | None = None) -> np.ndarray:
         """Return the sum of the components at places, shape [n, ny, nx]."""

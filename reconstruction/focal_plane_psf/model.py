@@ -411,10 +411,10 @@ def _fit_warnings(
     ccds = np.unique(field.data.places.ccd)
     if np.isfinite(fitted.evidence) and fitted.evidence < 0.0:
         wrong = "it is not the one that they were taken with, or its heights are far smaller than their prior allows"
-        few = f"{counted(len(ccds), 'CCD')} may be too few to tell it from turbulence; or "
+        of_few_ccds = f"{counted(len(ccds), 'CCD')} may be too few to tell it from turbulence; or "
         remarks.append(
             "the stars are less likely with this telescope than without any (ln ratio "
-            f"{fitted.evidence:.0f}): {few if len(ccds) <= _FEW_CCDS else ''}{wrong}"
+            f"{fitted.evidence:.0f}): {of_few_ccds if len(ccds) <= _FEW_CCDS else ''}{wrong}"
         )
     empty = [n for i, n in enumerate(field.mosaic.names) if i not in ccds and n in expected]
     if empty:

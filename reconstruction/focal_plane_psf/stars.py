@@ -241,9 +241,9 @@ class FocalPlaneStars(Result):
             if not files:
                 raise ProductError("no products of a run (ccd_*.fits)", file=place)
             weight = _product_weight_fwhm(files[0])
-            given = positive_angle(options.pop("weight_fwhm", weight), "weight_fwhm")
-            if not same_weight(given, weight):
-                raise ProductError(other_weight(given, weight), file=files[0])
+            stated_weight = positive_angle(options.pop("weight_fwhm", weight), "weight_fwhm")
+            if not same_weight(stated_weight, weight):
+                raise ProductError(other_weight(stated_weight, weight), file=files[0])
             products = [read_product(f, holdout_images=False) for f in files]
             return cls.from_products(products, weight, **options)
         require_file(place, ProductError)

@@ -82,7 +82,7 @@ class PsfSums:
         hdus = [fits.ImageHDU(self.count, name="COUNT"), image_hdu("TRUE", self.true, "sums of the true PSFs")]
         hdus.append(image_hdu("MODEL", self.model, "sums of the PSFs of the models"))
         columns = {
-            name: (np.array([getattr(one, name) for one in self.figures]), unit, description)
+            name: (np.array([getattr(of_visit, name) for of_visit in self.figures]), unit, description)
             for name, (unit, description) in FIGURES.items()
         }
         hdus.append(table_hdu("VISITS", columns))

@@ -251,7 +251,7 @@ def _write_products(
         columns["visitId"] = (np.array([visit.visit for visit in listed]), "", "number of the visit in the list")
         columns["weight"] = (np.array(weights), "nJy-2", "of its PSFs in the stack, by an inverse variance")
     for name, (unit, description) in FIGURES.items():
-        columns[name] = (np.array([getattr(one, name) for one in figures]), unit, description)
+        columns[name] = (np.array([getattr(of_visit, name) for of_visit in figures]), unit, description)
     write_ecsv(folder / "visits.ecsv", columns, {"what": "visits in the order of the stack", **stamp.meta()})
     summary = {
         **stamp.meta(),

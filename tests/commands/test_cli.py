@@ -119,7 +119,11 @@ LAYER = "  - {altitude: %g, weight: %g, wind_speed: %g}\n"
         ("", [(0, 0.6, 5), (5000, 0.4, 200)], ["mine.yaml: atmosphere.exposure_s = 15: ", "of at least 3029 "]),
         ("  exposure_s: 90\n", [(0, 1, 10)], ["mine.yaml: atmosphere.exposure_s = 90: ", "at least 909 "]),
         ("  time_step_s: 20\n", [(0, 1, 10)], ["atmosphere.time_step_s = 20: ", "atmosphere.exposure_s = 15"]),
-        ("  screen_size: 16\n  screen_length_m: 900\n", [(0, 1, 10)], ["atmosphere: cutoff = 0.0279253 rad/m"]),
+        (
+            "  screen_size: 16\n  screen_length_m: 900\n",
+            [(0, 1, 10)],
+            ["mine.yaml: atmosphere.screen_size = 16: ", "at least 431", "at most 33.4"],
+        ),
         ("  screen_size: 65537\n", [(0, 1, 10)], ["atmosphere: screen_size = 65537: expected a whole number"]),
         ("  site: none.yaml\n", [], ["none.yaml: no such file"]),
         ("  site: folder.yaml\n", [], ["folder.yaml: cannot be read"]),
