@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy import fft
@@ -150,6 +151,9 @@ class ImageGrid:
             * cell
             / spline
         )
+        #: Transfer function of air and detector at a strength of the turbulence [1/m], which rims have without a grid
+        #: that has them: rings of objects, and their arrays, would stay until Python looks for such garbage.
+        self._filter = partial(_air_and_detector, self._detector, self._exponent)
         # The filter has the images of cells, and the spline, which light of rims has not.
         self.rim_light = None if rims is None else RimLight(rims, side, wave, baseline, cell / spline, self._filter)
         # Squared frequencies over that of Nyquist, and the exponent of the air there.
@@ -181,10 +185,6 @@ class ImageGrid:
         grid.last, grid.point = None, None
         grid.rim_light = None if self.rim_light is None else self.rim_light.of(rims)
         return grid
-
-    def _filter(self, strength: float) -> np.ndarray:
-        """Return the transfer function of air and detector."""
-        return np.asarray(self._detector * np.exp(-self._exponent * strength ** (5.0 / 3.0)))
 
     def _edge(self, strength: float) -> float:
         """Return the exponent of the air at Nyquist's frequency."""
@@ -424,6 +424,11 @@ class ImageGrid:
         for axis in (0, 1):
             spectra[light.where, 1 + axis] -= 1j * (light.wave[:, axis] * self.pixel).astype(np.float32) * diffracted
         spectra[light.where, 3 : 3 + rims.response.shape[2]] += slopes * turn[:, None]
+
+
+def _air_and_detector(detector: np.ndarray, exponent: np.ndarray, strength: float) -> np.ndarray:
+    """Return the transfer function of air and detector."""
+    return np.asarray(detector * np.exp(-exponent * strength ** (5.0 / 3.0)))
 
 
 def _variance(edge: float) -> float:

@@ -8,6 +8,7 @@ constant, :math:`\sum (d + s) \ln(m + s) - (m + s)` with data d, model m and sky
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -144,7 +145,7 @@ class _Derivatives:
     weights: np.ndarray
     image: tuple[np.ndarray, np.ndarray, np.ndarray]
     misfit: float
-    curvature: tuple[Stamp, np.ndarray] | None = None
+    curvature: tuple[weakref.ref[Stamp], np.ndarray] | None = None
 
     def holds(self, stamp: Stamp, unknowns: np.ndarray, landing: np.ndarray, weights: np.ndarray) -> bool:
         """Return whether the derivatives are those of light that lands elsewhere, too, but for a few per cent."""
@@ -166,9 +167,9 @@ class _Derivatives:
 
 @dataclass(frozen=True)
 class _Point:
-    """The last linear model of a stamp, and its unknowns: checks of a solution follow each other."""
+    """The last linear model of a stamp, whose grid has it, and its unknowns: checks of a solution follow each other."""
 
-    stamp: Stamp
+    stamp: weakref.ref[Stamp]
     unknowns: np.ndarray
     wave: np.ndarray
     linearized: Linearized
@@ -176,7 +177,7 @@ class _Point:
     def is_of(self, stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> bool:
         """Return whether it is that of a stamp at unknowns."""
         same = np.array_equal(self.unknowns, unknowns) and np.array_equal(self.wave, wave)
-        return self.stamp is stamp and same
+        return self.stamp() is stamp and same
 
 
 def _derivatives(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> tuple[np.ndarray, ...] | None:
@@ -211,7 +212,7 @@ def linearized(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> Lineariz
     brightness = unknowns[FLUX] * columns[..., FLUX].astype(np.float64)
     over_noise = _over_noise((stamp.image - model).astype(np.float32)[..., None], variance, stamp.used)[:, 0]
     point = Linearized(model, variance, brightness, stamp.used, residual, over_noise, scaled, scales)
-    stamp.grid.point = _Point(stamp, unknowns.copy(), wave.copy(), point)
+    stamp.grid.point = _Point(weakref.ref(stamp), unknowns.copy(), wave.copy(), point)
     return point
 
 
@@ -269,10 +270,10 @@ def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> No
     variance, last = pixel_variance(stamp, model), stamp.grid.last
     assert isinstance(last, _Derivatives)
     pixels = columns.reshape(-1, columns.shape[-1])
-    if last.curvature is None or last.curvature[0] is not stamp:
+    if last.curvature is None or last.curvature[0]() is not stamp:
         root = np.where(stamp.used, 1.0 / np.sqrt(variance), 0.0).astype(np.float32)
         scaled = pixels * root.reshape(-1, 1)
-        last.curvature = stamp, scaled.T @ scaled
+        last.curvature = weakref.ref(stamp), scaled.T @ scaled
     residual = stamp.image - model
     slopes = np.where(stamp.used, residual / variance, 0.0).astype(np.float32)
     gradient = pixels.T @ slopes.ravel() * scales
