@@ -67,7 +67,7 @@ class Sensitivity(FieldResult):
 
     @property
     def rms(self) -> np.ndarray:
-        """Rms wavefront over the field without piston and tilt, per unit of each parameter [m], shape [n_parameter]."""
+        """Rms wavefront over the field without piston and tilt, in metres per unit of each parameter, [n_parameter]."""
         return np.sqrt((self.matrix[:, 3:] ** 2).sum(axis=1).mean(axis=0))
 
     @check_arguments

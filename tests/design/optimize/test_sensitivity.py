@@ -75,6 +75,8 @@ def test_the_terms_are_those_of_the_fit(lsst_r, result, zernikes):
     assert np.abs(result.zernikes - zernikes(lsst_r)).max() < 1e-14
     assert result.matrix.shape == (3, 28, len(STEPS))
     assert result.rms.shape == (len(STEPS),)
+    # The unit is another one for each parameter.
+    assert result.to_table()["rms"].unit is None
 
 
 @pytest.mark.parametrize("address", list(STEPS))
