@@ -12,7 +12,7 @@ import numpy as np
 from ...core.page import Picture
 from ...core.second_process import Submit
 from ...measure.correlation import Correlation
-from ...reconstruction.ccd_product import CcdProduct, CcdStars
+from ...reconstruction.ccd_product import CCD_KINDS, CcdProduct, CcdStars
 from ..experiment import Experiment
 from ..resolved_values import noise_free_components
 from ..summary import CORRELATED, has_focal_plane_model
@@ -64,6 +64,8 @@ def draw_pictures(
     # The paper's figures are the LSST's.
     paper = experiment.camera.name == "lsst"
     optics, focal_plane_model = not config.atmosphere.enabled, has_focal_plane_model(products)
+    # Stars of few coarse pixels have no adaptive moments.
+    of_models = correlated_g if {"residual", "away", *CCD_KINDS} <= correlated_g.keys() else correlated
     recipe, radius = config.reconstruction.psf_recipe(), experiment.field_radius_on_detector
     # Without images and models, stars are soon sent to another process.
     stars, close = [p.ccd_stars for p in products], closest_middle_farthest(products)
@@ -191,9 +193,10 @@ def draw_pictures(
         ),
         _PendingPicture(
             "Residuals of both models",
-            partial(models_plot, correlated_g),
-            "ξ+ of g, of the residuals of the two models, fitted to the same stars: of the whole focal plane, which "
-            "all other plots show, and CCD by CCD. Filled symbols are positive, open ones negative."
+            partial(models_plot, of_models),
+            f"ξ+ of {'g' if of_models is correlated_g else 'the weighted e'}, of the residuals of the two models, "
+            "fitted to the same stars: of the whole focal plane, which all other plots show, and CCD by CCD. Filled "
+            "symbols are positive, open ones negative."
             + (
                 " Residuals at the stars sum to zero over each CCD where it has a model of its own, so their "
                 "correlation between CCDs cancels whatever the error of that model is."

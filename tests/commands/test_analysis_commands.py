@@ -17,7 +17,10 @@ COMMANDS = {
     "lateral-color": (FIELD, "spread [µm]"),
     "focal-shift": (["--zone", "0.9"], "zone by zone"),
     "seidel": (["--field-deg", "0.4"], "W131 coma"),
-    "spot-matrix": (["--field-deg", "0", "--rays", "3", "--range-um", "-9", "9", "--steps", "2"], "rms of each column"),
+    "spot-matrix": (
+        ["--field-deg", "0", "--rays", "3", "--range-um", "-9", "9", "--steps", "2"],
+        "rms [µm] at -9, 9 µm",
+    ),
     "illumination": ([*FIELD, "--rays", "50"], "relative illumination [%]"),
     "throughput": (FIELD, "wavelength [nm]"),
     "strehl": (["--field-deg", "0", "--no-psf"], "of the wavefront"),

@@ -128,8 +128,8 @@ def test_a_run_with_a_rotated_camera(tiny, tmp_path, monkeypatch):
     products = [read_product(product_path(tmp_path / "run", n)) for n in config.ccds]
     assert [p.rotator for p in products] == [pytest.approx(0.5 * np.pi, abs=1e-15)] * 2
     far = products[1].observed
-    # R24_S12 lies on +x of the camera, which is +y of the telescope.
-    assert (far.x > 0.2).all()
-    assert (far.field_y > 0.02).all()
-    assert (np.abs(far.field_x) < 0.005).all()
+    # R24_S12 lies on +y of the camera, which is -x of the telescope.
+    assert (far.y > 0.2).all()
+    assert (far.field_x < -0.02).all()
+    assert (np.abs(far.field_y) < 0.005).all()
     assert diagnose(tmp_path / "run").overall["ccds"] == 2

@@ -98,7 +98,7 @@ def test_galaxies_of_a_catalogue_are_measured_where_and_as_it_says(folder, backw
     e = ellipticity_along(frame.matrix, e1 + 1j * e2)[2:]
     np.testing.assert_allclose(galaxies.true_e1 + 1j * galaxies.true_e2, e, atol=0.015)
     # Equal noise under a shear and its opposite leaves errors of 0.001.
-    assert abs(found.calibration["true"].m).max() < 0.005
+    assert abs(found.biases.gaussian["true"].m).max() < 0.005
     # Other galaxies leave the stacks of PSFs as they are; the same ones keep finished tiles.
     tile = next((folder / "galaxies").iterdir())
     before = tile.stat().st_mtime_ns
