@@ -252,11 +252,18 @@ class Experiment:
         """Make the screens of the atmosphere, where they are not made, as far as the CCDs of the configuration need."""
         if self.atmosphere is None or not self.screen_kinds:
             return
-        fields = corner_fields(self.telescope, self.camera, self.config.ccds or ())
-        # Half a pupil of room, for stars beyond the edges of the CCDs and the curvature of the field.
-        rows = self.atmosphere.rows_under(field_direction(*fields.T), self.telescope.pupil_diameter)
+        rows = self.screen_rows
         for kind in self.screen_kinds:
             self.atmosphere.screens(kind, threads, rows)
+
+    @property
+    def screen_rows(self) -> np.ndarray:
+        """Rows of the slopes of screens that light of the CCDs crosses, bool [n_layer, size]; none without screens."""
+        if self.atmosphere is None:
+            return np.zeros((0, 0), dtype=bool)
+        fields = corner_fields(self.telescope, self.camera, self.config.ccds or ())
+        # Half a pupil of room, for stars beyond the edges of the CCDs and the curvature of the field.
+        return self.atmosphere.rows_under(field_direction(*fields.T), self.telescope.pupil_diameter)
 
     @contextmanager
     @check_arguments

@@ -15,7 +15,7 @@ from .resolved_values import resolved_value
 # Python with its libraries and kernels while PSFs are made [byte].
 _BASE = 400_000_000
 # The same with the pictures of the report, when the screens are gone [byte].
-_REPORT = 600_000_000
+_REPORT = 650_000_000
 # A thread of the wave engine: fields, intensities and spectra of a star at five wavelengths [byte].
 _WAVE_THREAD = 150_000_000
 # The same in silicon besides: intensities and phases of three depths of each [byte].
@@ -25,8 +25,11 @@ _STAMP_BYTES = 48
 
 
 def screen_bytes(experiment: Experiment) -> int:
-    """Return the memory of the screens of an experiment [bytes]."""
-    return 0 if experiment.atmosphere is None else experiment.atmosphere.screen_bytes(experiment.screen_kinds)
+    """Return the memory of the screens of an experiment, as far as its CCDs need them [bytes]."""
+    air, kinds = experiment.atmosphere, experiment.screen_kinds
+    if air is None:
+        return 0
+    return air.screen_bytes(kinds, experiment.screen_rows if "slopes" in kinds else None)
 
 
 def needed_bytes(experiment: Experiment, threads: int | None = None) -> int:

@@ -78,10 +78,16 @@ class LayerScreens(Layers):
             return self.fine_size, self.fine_length, (self.cutoff, math.inf)
         return self.screen_size, self.screen_length, (0.0, self.cutoff)
 
-    def screen_bytes(self, scales: Iterable[str]) -> int:
-        """Return the memory of the screens of some scales, and the working memory for the last of them [bytes]."""
+    def screen_bytes(self, scales: Iterable[str], rows: np.ndarray | None = None) -> int:
+        """Return the memory of the screens of some scales, and the working memory for the last of them [bytes].
+
+        Of slopes only the ``rows`` count, bool [n_layer, screen_size], where they are given.
+        """
+        scales = tuple(scales)
         grids = [self._band(scale) for scale in scales]
         stored = sum(4 * self.layer_count * size * size for size, _, _ in grids)
+        if rows is not None and "slopes" in scales:
+            stored -= 4 * int((~rows).sum()) * self.screen_size
         return stored + max((working_bytes(*grid) for grid in grids), default=0)
 
     def low_screen(
@@ -194,7 +200,7 @@ class LayerScreens(Layers):
         name = "fine_size" if kind == "high" else "screen_size"
 
         def allocate() -> np.ndarray:
-            require_bytes(self.screen_bytes([kind]), f"{name} = {size} in {self.layer_count} layers")
+            require_bytes(self.screen_bytes([kind], rows), f"{name} = {size} in {self.layer_count} layers")
             # Memory of rows that are never made is never touched.
             return np.empty((self.layer_count, size, size), dtype=dtype)
 
