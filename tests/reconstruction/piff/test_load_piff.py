@@ -239,7 +239,11 @@ def test_a_model_of_des_has_the_error_of_its_world_coordinates_said():
 @pytest.mark.filterwarnings("ignore::pachon.errors.WcsWarning")
 def test_a_model_of_des_is_within_half_a_percent_of_piff():
     """Piff draws each star with the Jacobian and the place that the file has for it: its WCS needs pixmappy."""
-    piff, galsim = pytest.importorskip("piff"), pytest.importorskip("galsim")
+    # The folder of these tests passes for an empty package of that name.
+    pytest.importorskip("piff.simplepsf")
+    import piff
+
+    galsim = pytest.importorskip("galsim")
     psf = pachon.load_piff(DES)
     with fits.open(DES) as hdus:
         stars, q = hdus["psf_stars"].data, np.array(hdus["psf_interp_solution"].data["q"][0])
@@ -327,7 +331,7 @@ def test_wrong_places_chips_and_properties_are_named():
 
 @pytest.mark.slow
 def test_fresh_files_of_piff_are_read_too(tmp_path):
-    pytest.importorskip("piff")
+    pytest.importorskip("piff.simplepsf")
     sys.path.insert(0, str(Path(__file__).parents[2] / "peers"))
     from piff_files import PLACES, write_files
 
