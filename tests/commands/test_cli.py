@@ -204,7 +204,7 @@ def test_screens_too_large_for_the_memory_are_one_line(capsys, in_folder, monkey
     monkeypatch.setattr(memory, "available_bytes", lambda: 21_000_000_000)
     (in_folder / "mine.yaml").write_text("atmosphere: {screen_size: 65536}\n")
     line = refused(capsys, "run", "mine.yaml")
-    assert "atmosphere.screen_size = 65536: needs about 105 GB of memory, 21 GB are free; 16384 would do" in line
+    assert "atmosphere.screen_size = 65536: needs about 33 GB of memory, 21 GB are free; 32768 would do" in line
     assert not (in_folder / "pachon_run").exists()
 
 
