@@ -67,6 +67,11 @@ def card_text(text: str) -> str:
     return text.encode("ascii", "backslashreplace").decode()
 
 
+def card_value(value: object) -> object:
+    """Return the value of a FITS card, texts by :func:`card_text`."""
+    return card_text(value) if isinstance(value, str) else value
+
+
 def text_of_card(text: str) -> str:
     """Return the text that :func:`card_text` has made ASCII."""
     return _ESCAPE.sub(lambda escape: chr(int(escape[0][2:], 16)), text)
@@ -81,7 +86,7 @@ def write_fits(path: Path, hdus: list[Any], stamp: Stamp | None, cards: Sequence
     primary = fits.PrimaryHDU()
     parts = ("NPARTS", 1 + len(hdus), "header and extensions of this file")
     for keyword, value, comment in [*(stamp.cards() if stamp else []), parts, *cards]:
-        primary.header[keyword] = (card_text(value) if isinstance(value, str) else value, comment)
+        primary.header[keyword] = (card_value(value), comment)
     write_hdus(path, fits.HDUList([primary, *hdus]))
 
 

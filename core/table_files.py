@@ -19,7 +19,7 @@ from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
 from .errors import ConfigError, PachonError, ProductError
 from .files import parsing, read_bytes, text_lines, write_bytes
-from .products import Card, Columns, card_text
+from .products import Card, Columns, card_text, card_value
 from .units import metres, pure_numbers, radians
 
 #: Formats of astropy, or Parquet, by the ending of the file.
@@ -211,7 +211,7 @@ def _encoded(table: Table, kind: str, path: Path, images: Mapping[str, Described
                 hdu.header["BUNIT"] = unit
             hdu.header["COMMENT"] = card_text(meaning)
             for key, value, comment in cards:
-                hdu.header[key] = (card_text(value) if isinstance(value, str) else value, comment)
+                hdu.header[key] = (card_value(value), comment)
             hdus.append(hdu)
         file_data = io.BytesIO()
         hdus.writeto(file_data)
@@ -224,7 +224,7 @@ def _with_ascii_texts(table: Table) -> Table:
     """Return a table with the texts that FITS takes: names, cells and metadata by :func:`~.products.card_text`."""
     ascii_table = table.copy(copy_data=False)
     for key, value in table.meta.items():
-        ascii_table.meta[key] = card_text(value) if isinstance(value, str) else value
+        ascii_table.meta[key] = card_value(value)
     for name in table.colnames:
         column = ascii_table[name]
         column.info.description = card_text(column.info.description or "") or None

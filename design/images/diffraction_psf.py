@@ -133,7 +133,7 @@ class DiffractionPsf(FieldResult):
 
     def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
-        arcsec = arcseconds(self.plate_scale)
+        arcsec, fwhm = arcseconds(self.plate_scale), self.fwhm
         return {
             "telescope": self.telescope,
             "method": self.method,
@@ -144,8 +144,8 @@ class DiffractionPsf(FieldResult):
             **self.field_items(),
             **self.on_image({"reference_mm": self.reference_point * 1e3}),
             "strehl": self.strehl,
-            **self.on_image({"fwhm_um": self.fwhm * 1e6}),
-            **self.of_sky({"fwhm_arcsec": self.fwhm * arcsec}),
+            **self.on_image({"fwhm_um": fwhm * 1e6}),
+            **self.of_sky({"fwhm_arcsec": fwhm * arcsec}),
             **self.on_image({"centroid_um": self.centroid * 1e6, "airy_radius_um": self.airy_radius * 1e6}),
             **self.of_sky({"airy_radius_arcsec": self.airy_radius * arcsec}),
             "light_inside": self.inside,

@@ -206,7 +206,6 @@ def diffracted_energy(
     middle is that of an image of this field alone.
     """
     psf = fft_psf(request, pixels=pixels, n_pupil=n_pupil, reference=reference, progress=progress)
-    energy = _of_images(psf, radii)
     finer = {}
     for i in np.flatnonzero(psf.undersampled):
         alone = fft_psf(request.at_fields(slice(i, i + 1)), pixels=pixels, n_pupil=n_pupil, reference=reference)
@@ -214,7 +213,8 @@ def diffracted_energy(
             finer[i] = alone
     if radii is None:
         edges = {float(alone.axis[-1]) for alone in finer.values()} | {float(psf.axis[-1])}
-        energy = _of_images(psf, np.unique(np.concatenate([np.linspace(0.0, edge, _RADII) for edge in edges])))
+        radii = np.unique(np.concatenate([np.linspace(0.0, edge, _RADII) for edge in edges]))
+    energy = _of_images(psf, radii)
     radius, fraction = energy.radius, energy.fraction.copy()
     for i, alone in finer.items():
         edge = float(alone.axis[-1])

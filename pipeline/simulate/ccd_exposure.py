@@ -204,7 +204,7 @@ def _expose_twice(
     inner = moved.image[:, rim:-rim, rim:-rim]
     light = inner.sum(axis=(1, 2), keepdims=True, dtype=np.float64)
     centered = (inner / np.where(light > 0.0, light, 1.0)).astype(np.float32)
-    return replace(moved, image=images, offset=offsets, first=None), replace(moved, image=centered, first=None)
+    return replace(moved, image=images, offset=offsets), replace(moved, image=centered)
 
 
 def expose_centered(

@@ -17,7 +17,7 @@ from astropy.table import Table
 from pydantic import Field
 
 from ...core.errors import ConfigError
-from ...core.products import card_text, write_hdus
+from ...core.products import card_text, card_value, write_hdus
 from ...core.random_streams import stream
 from ...core.schema import Count, NotNegative, Positive, Section, Whole
 from ...core.set_keys import with_set_keys
@@ -234,7 +234,7 @@ def write_donuts(path: Path, donuts: SimulatedDonuts, scene: DonutScene, model: 
         "SEED": (scene.seed, "seed of all random numbers"),
     }
     for key, (content, comment) in cards.items():
-        value = card_text(content) if isinstance(content, str) else content
+        value = card_value(content)
         # A card has 80 characters: a path may leave none for a comment.
         room = 80 - len("KEYWORD = ' ' / ") - len(str(value))
         cube.header[key] = (value, comment) if len(comment) <= room else value

@@ -23,7 +23,7 @@ from ...measure.focal_plane_axes import draw_compass, draw_whisker_panels
 from ...measure.shapes import Shapes, measure_shapes
 from ...sky.sky_shapes import along_sky
 from .psf_visit import VisitPsfs
-from .visit_figures import FIGURES, VisitFigures
+from .visit_figures import FIGURES, VisitFigures, figure_columns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -81,11 +81,7 @@ class PsfSums:
         """Write the sums, exactly as they are."""
         hdus = [fits.ImageHDU(self.count, name="COUNT"), image_hdu("TRUE", self.true, "sums of the true PSFs")]
         hdus.append(image_hdu("MODEL", self.model, "sums of the PSFs of the models"))
-        columns = {
-            name: (np.array([getattr(of_visit, name) for of_visit in self.figures]), unit, description)
-            for name, (unit, description) in FIGURES.items()
-        }
-        hdus.append(table_hdu("VISITS", columns))
+        hdus.append(table_hdu("VISITS", figure_columns(self.figures)))
         if self.weight is not None:
             hdus.append(fits.ImageHDU(self.weight, name="WEIGHT"))
         write_fits(path, hdus, stamp, [(VISITS_CARD, self.visits, "in the sums")])

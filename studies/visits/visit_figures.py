@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.products import Columns
+from ...core.statistics import finite_mean
 from ...core.units import ARCSEC
 from ...measure.shapes import measure_shapes
 
@@ -55,5 +58,12 @@ class VisitFigures:
 
 def rms_modulus(e1: np.ndarray, e2: np.ndarray) -> float:
     """Return the rms of the absolute value of an ellipticity; NaN of none."""
-    square = e1**2 + e2**2
-    return float(np.sqrt(np.nanmean(square))) if np.isfinite(square).any() else float("nan")
+    return float(np.sqrt(finite_mean(e1**2 + e2**2)))
+
+
+def figure_columns(visits: Sequence[VisitFigures]) -> Columns:
+    """Return the figures of visits as columns of a table."""
+    return {
+        name: (np.array([getattr(figures, name) for figures in visits]), unit, description)
+        for name, (unit, description) in FIGURES.items()
+    }

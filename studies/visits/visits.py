@@ -37,7 +37,7 @@ from .psf_visit import (
 from .sky_points import SkyPoints, draw_points
 from .stack import PsfStack, PsfSums
 from .stack_metrics import StackCorrelations, stack_correlations, stack_metrics
-from .visit_figures import FIGURES, VisitFigures
+from .visit_figures import VisitFigures, figure_columns
 
 #: Sums of the visits so far, from which the stack goes on.
 SUMS_NAME = "sums.fits"
@@ -250,8 +250,7 @@ def _write_products(
         weights = [stack_weight(visit_experiment(experiment, v), v) for v in visits]
         columns["visitId"] = (np.array([visit.visit for visit in listed]), "", "number of the visit in the list")
         columns["weight"] = (np.array(weights), "nJy-2", "of its PSFs in the stack, by an inverse variance")
-    for name, (unit, description) in FIGURES.items():
-        columns[name] = (np.array([getattr(of_visit, name) for of_visit in figures]), unit, description)
+    columns |= figure_columns(figures)
     write_ecsv(folder / "visits.ecsv", columns, {"what": "visits in the order of the stack", **stamp.meta()})
     summary = {
         **stamp.meta(),
