@@ -126,12 +126,7 @@ def opd_view(scene: Scene) -> OpdView:
     opd = wavefront_opd(scene.telescope, scene.field, scene.wavelength, grid=_GRID, focal_plane=plane)
     flat = opd.without_tilt * 1e9
     request = Request.of(scene.telescope, scene.field[None], scene.wavelength).on(plane)
-    try:
-        fit = wavefront_zernikes(request, jmax=JMAX)
-    except DomainError:
-        # Rays beyond the clear apertures may miss the detector.
-        fit = wavefront_zernikes(request, jmax=JMAX, pupil="lit")
-    zernikes = fit.coefficients[0] * 1e9
+    zernikes = wavefront_zernikes(request, jmax=JMAX).coefficients[0] * 1e9
     lit = np.isfinite(flat)
     rms = float(np.sqrt(np.mean(flat[lit] ** 2))) if lit.any() else math.nan
     step = float(opd.x[0, 1] - opd.x[0, 0]) if opd.x.shape[1] > 1 else 0.0

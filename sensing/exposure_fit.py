@@ -207,7 +207,7 @@ class ExposureDonuts(WavefrontFit):
             )
             columns = response.matrix[:, noll - 1] * spreads
             coefficients = wavefront_zernikes(
-                state, fields, wavelength, jmax=last, projection=usable.projection
+                state, fields, wavelength, jmax=last, pupil="full", projection=usable.projection
             ).coefficients
             believed = coefficients if believed is None else believed
             made = (coefficients - believed)[:, noll - 1] - columns @ (values / spreads)

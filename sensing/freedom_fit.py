@@ -126,7 +126,9 @@ class TelescopeFreedoms(WavefrontFit):
         values = joint.shared[:count]
         after = freedoms.apply(telescope, values)
         believed, estimated = (
-            wavefront_zernikes(t, fields, wavelength, jmax=last, projection=projection).coefficients[:, noll - 1]
+            wavefront_zernikes(t, fields, wavelength, jmax=last, pupil="full", projection=projection).coefficients[
+                :, noll - 1
+            ]
             for t in (telescope, after)
         )
         many = max(last, _MANY_TERMS)

@@ -31,11 +31,10 @@ from ..core.number_text import counted
 from ..core.plotting import axes_at, plain_text, styled
 from ..core.result import Result
 from ..core.units import ARCSEC, length
-from ..design.metrics.field_zernikes import name_terms, pupil_to_fit, wavefront_zernikes
+from ..design.metrics.field_zernikes import name_terms, wavefront_zernikes
 from ..models.telescope import Telescope
 from ..models.zernike_polynomials import annular_zernikes, noll_to_nm
 from ..raytrace.rays import Projection
-from ..wavefront.request import Request
 from .degrees import FreedomEstimate
 from .frames import DonutFrames, FrameName, zernike_matrix
 
@@ -209,8 +208,7 @@ def observatory_zernikes(
     with_result = np.isfinite(values).all(axis=1)
     if design is not None and with_result.any():
         middle, fields = float(fit.wavelengths[len(fit.wavelengths) // 2]), fit.fields[with_result]
-        request = Request.of(design, fields, middle, projection=fit.projection, one_wavelength=True)
-        wavefront = wavefront_zernikes(request, jmax=int(fit.noll.max()), pupil=pupil_to_fit(request))
+        wavefront = wavefront_zernikes(design, fields, middle, jmax=int(fit.noll.max()), projection=fit.projection)
         values[with_result] += wavefront.coefficients[:, fit.noll - 1]
     matrix = scale * zernike_matrix(fit.noll, frames.axes(frame)[:2, :2])
     matrix = matrix @ reexpansion(fit.noll, fit.obscuration, obscuration)

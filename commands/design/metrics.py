@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from ...design.metrics.field_zernikes import DoubleZernikes, FieldZernikes, FittedPupil, ZernikeOrdering
+    from ...design.metrics.field_zernikes import DoubleZernikes, FieldZernikes, PupilToFit, ZernikeOrdering
     from ...wavefront.pupil_sampling import SamplingName
 
 
@@ -109,13 +109,13 @@ def zernikes(
     shared: SharedOptions,
     jmax: Annotated[int, Option(min=4, max=500, help="Highest index in the pupil.")] = 28,
     pupil: Annotated[
-        str | None,
+        str,
         choice(
-            ("full", "lit"),
-            help="full: the whole annulus, orthogonal; lit: where light passes, the default where stopped rays would "
-            "spoil the terms.",
+            ("auto", "full", "lit"),
+            help="full: the whole annulus, orthogonal; lit: where light passes; auto: full, but lit where stopped rays "
+            "would spoil the terms.",
         ),
-    ] = None,
+    ] = "auto",
     over_field: Annotated[bool, Option("--map", help="Maps over the field of view.")] = False,
     double: Annotated[
         int | None, Option(min=1, max=200, metavar="KMAX", help="Double Zernikes, terms in the field.")
@@ -131,7 +131,7 @@ def zernikes(
     - `pachon zernikes lsst_v3.3_r --double 22 --json`: Zernikes of the field times those of the pupil
     - `pachon zernikes my_lens.zmx --fringe --jmax 37`: as interferometers order and scale them
     """
-    from ...design.metrics.field_zernikes import double_zernikes, pupil_to_fit, wavefront_zernikes
+    from ...design.metrics.field_zernikes import double_zernikes, wavefront_zernikes
     from ...design.metrics.vignetting import field_disc
     from ...wavefront.request import Request
 
@@ -142,12 +142,12 @@ def zernikes(
         raise ConfigError("--fringe and --double: expected one of them")
     fields = None if double is not None else field_disc(telescope) if over_field else shared.fields
     request = Request.of(telescope, fields, shared.wavelength, one_wavelength=True, **shared.trace_options)
-    fitted = pupil_to_fit(request) if pupil is None else cast("FittedPupil", pupil)
+    to_fit = cast("PupilToFit", pupil)
     if double is not None:
-        terms = double_zernikes(request, jmax=jmax, kmax=double, pupil=fitted)
+        terms = double_zernikes(request, jmax=jmax, kmax=double, pupil=to_fit)
         return Outcome(terms, _double_rows, stem=f"double_zernikes_{shared.stem}")
     ordering: ZernikeOrdering = "fringe" if fringe else "noll"
-    coefficients = wavefront_zernikes(request, jmax=jmax, pupil=fitted, ordering=ordering)
+    coefficients = wavefront_zernikes(request, jmax=jmax, pupil=to_fit, ordering=ordering)
     return Outcome(coefficients, _map_rows if over_field else _rows)
 
 

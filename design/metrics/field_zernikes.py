@@ -32,8 +32,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FittedPupil = Literal["full", "lit"]
 #: Fitted points: the whole annulus, or where light passes.
+FittedPupil = Literal["full", "lit"]
+#: The same, or whichever has a smooth wavefront.
+PupilToFit = Literal["auto", "full", "lit"]
 ZernikeOrdering = Literal["noll", "fringe"]
 #: Maps of single terms in one plot.
 _MAPS = 8
@@ -211,7 +213,7 @@ def wavefront_zernikes(
     wavelength: ArrayLike | None = None,
     *,
     jmax: int = 28,
-    pupil: FittedPupil = "full",
+    pupil: PupilToFit = "auto",
     ordering: ZernikeOrdering = "noll",
     sampling: SamplingName | PupilSampling | None = None,
     n_pupil: int | None = None,
@@ -228,10 +230,11 @@ def wavefront_zernikes(
         As in :meth:`pachon.Request.of`.
     jmax : int
         Highest index; at most 37 in Fringe order.
-    pupil : {"full", "lit"}
+    pupil : {"auto", "full", "lit"}
         "full": project on the whole annulus, clear apertures ignored. The terms stay orthogonal, so a coefficient does
         not depend on `jmax`, and it varies smoothly over the field. "lit": fit where light passes, as for a measured
-        wavefront.
+        wavefront. "auto": "full", but "lit" at all fields where, at one of them, the rays that apertures stop miss the
+        detector or have no smooth wavefront. The result says which.
     ordering : {"noll", "fringe"}
         Noll's order of annular terms of rms one, or the Fringe order of terms of the full disc of amplitude one. Fringe
         terms are not orthogonal over an annulus: there they are fitted by least squares, as in Zemax.
@@ -261,30 +264,28 @@ def wavefront_zernikes(
     noll = ordering == "noll"
     terms = (annular_zernikes(jmax, x, y, telescope.pupil_obscuration) if noll else fringe_zernikes(jmax, x, y)).T
     coefficients, residual = np.empty((len(points), jmax)), np.empty(len(points))
+    fitted: FittedPupil = "lit" if pupil == "lit" else "full"
+    smooth_terms = annular_zernikes(min(_SMOOTH_TERMS, len(sample)), x, y, telescope.pupil_obscuration).T
     for rows, batch in request.parts():
         value, lit = _wavefronts(batch)
-        used = np.isfinite(value) & (lit | (pupil == "full"))
-        coefficients[rows], residual[rows] = _fit(terms, value, used, sample.weights, batch.fields, pupil)
-    return FieldZernikes(request, coefficients, residual, telescope.pupil_obscuration, pupil, ordering)
+        if pupil == "auto" and not _smooth(value, lit, smooth_terms, batch):
+            return wavefront_zernikes(request, jmax=jmax, pupil="lit", ordering=ordering)
+        used = np.isfinite(value) & (lit | (fitted == "full"))
+        coefficients[rows], residual[rows] = _fit(terms, value, used, sample.weights, batch.fields, fitted)
+    return FieldZernikes(request, coefficients, residual, telescope.pupil_obscuration, fitted, ordering)
 
 
-def pupil_to_fit(request: Request) -> FittedPupil:
-    """Return "full", or "lit" where the rays that apertures stop at a field of a request have no smooth wavefront."""
-    count = min(_SMOOTH_TERMS, len(request.pupil))
-    x, y = request.unit_pupil.T
-    terms = annular_zernikes(count, x, y, request.telescope.pupil_obscuration).T
+def _smooth(value: np.ndarray, lit: np.ndarray, terms: np.ndarray, request: Request) -> bool:
+    """Return whether wavefronts [n_field, n_pupil] are smooth beyond the apertures that cut their light."""
     weights = request.pupil.weights
-    for _, batch in request.parts():
-        value, lit = _wavefronts(batch)
-        stopped = lit @ weights < _MOSTLY_LIT * weights.sum()
-        if not np.isfinite(value).all():
-            return "lit"
-        if stopped.any():
-            used = np.ones_like(lit[stopped])
-            _, residual = _fit(terms, value[stopped], used, weights, batch.fields[stopped], "full")
-            if residual.max() > _SMOOTH_RESIDUAL * request.wavelength:
-                return "lit"
-    return "full"
+    stopped = lit @ weights < _MOSTLY_LIT * weights.sum()
+    if not np.isfinite(value).all():
+        return False
+    if not stopped.any():
+        return True
+    used = np.ones_like(lit[stopped])
+    _, residual = _fit(terms, value[stopped], used, weights, request.fields[stopped], "full")
+    return bool(residual.max() <= _SMOOTH_RESIDUAL * request.wavelength)
 
 
 def _wavefronts(request: Request) -> tuple[np.ndarray, np.ndarray]:
@@ -320,7 +321,7 @@ def double_zernikes(
     kmax: int = 22,
     rings: int = 8,
     field_radius: ArrayLike | None = None,
-    pupil: FittedPupil = "full",
+    pupil: PupilToFit = "auto",
     sampling: SamplingName | PupilSampling | None = None,
     n_pupil: int | None = None,
     threads: int | None = None,

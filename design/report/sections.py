@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
 from ...models.telescope import Telescope
-from ...wavefront.request import Request
 from ..analyses.analysis import band_wavelengths
 from ..analyses.color import chromatic_focus, lateral_color
 from ..analyses.field_curvature import field_curvature
@@ -26,7 +25,7 @@ from ..analyses.throughput import throughput
 from ..images.encircled_energy import encircled_energy
 from ..images.mtf import mtf
 from ..layout.layout import layout
-from ..metrics.field_zernikes import pupil_to_fit, wavefront_zernikes
+from ..metrics.field_zernikes import wavefront_zernikes
 from ..metrics.footprint import footprint
 from ..metrics.spots import SpotDiagram, spots
 from ..metrics.through_focus import through_focus
@@ -82,11 +81,6 @@ def _strehl(w: Where) -> Figure:
     except DomainError:
         # Aberrations of very many waves have no diffraction image worth its time.
         return strehl(*where, from_psf=False, threads=w.threads).plot()
-
-
-def _zernikes(w: Where) -> Figure:
-    request = Request.of(w.telescope, w.fields, w.one_wavelength, threads=w.threads)
-    return wavefront_zernikes(request, pupil=pupil_to_fit(request)).plot()
 
 
 #: In the order of the report.
@@ -145,7 +139,7 @@ SECTIONS = (
     Section(
         "Wavefront in Zernike terms",
         "Annular Zernike terms of the wavefront in Noll's order; a term is its own rms.",
-        _zernikes,
+        lambda w: wavefront_zernikes(w.telescope, w.fields, w.one_wavelength, threads=w.threads).plot(),
     ),
     Section(
         "Strehl ratio",

@@ -22,7 +22,7 @@ from ...core.random_streams import stream
 from ...core.schema import Count, NotNegative, Positive, Section, Whole
 from ...core.set_keys import with_set_keys
 from ...core.units import ARCSEC, radians
-from ...design.metrics.field_zernikes import pupil_to_fit, wavefront_zernikes
+from ...design.metrics.field_zernikes import wavefront_zernikes
 from ...models.camera.photometry import READ_NOISE
 from ...models.parameters.parameters import Parameter, apply
 from ...models.telescope import Telescope
@@ -31,7 +31,7 @@ from ...sensing.stamp_headers import PIXEL_KEY, TELESCOPE_KEY, WAVELENGTH_KEY
 from ...wavefront.corner_stars import corner_stars
 from ...wavefront.psf.stamps import Stamps
 from ...wavefront.pupil_optics import trace_pupils
-from ...wavefront.request import Request, wavelength_points
+from ...wavefront.request import wavelength_points
 from .donuts import STAMP_SIZE, draw_donuts
 
 #: Noll indices of the true wavefront.
@@ -171,11 +171,11 @@ def simulate_donuts(
             stamps=Stamps(size),
         ).images
     waves = wavelength_points(telescope, None if model.light is None else model.light.wavelengths)
-    requests = [Request.of(t, fields, float(waves[len(waves) // 2]), one_wavelength=True) for t in (telescope, true)]
-    # Images know nothing of rays that apertures stop.
-    pupil = pupil_to_fit(requests[0])
-    before, after = (wavefront_zernikes(r, jmax=int(_NOLL[-1]), pupil=pupil).coefficients for r in requests)
-    return SimulatedDonuts(images, fields, defocus, (after - before)[:, _NOLL - 1], float(waves.mean()))
+    middle, last = float(waves[len(waves) // 2]), int(_NOLL[-1])
+    before = wavefront_zernikes(telescope, fields, middle, jmax=last)
+    after = wavefront_zernikes(true, fields, middle, jmax=last, pupil=before.pupil)
+    zernikes = (after.coefficients - before.coefficients)[:, _NOLL - 1]
+    return SimulatedDonuts(images, fields, defocus, zernikes, float(waves.mean()))
 
 
 def _check_corners(telescope: Telescope, scene: DonutScene, field: np.ndarray | None) -> None:

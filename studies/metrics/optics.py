@@ -58,9 +58,9 @@ def landing(scene: Scene) -> dict[str, float]:
 
 @OPTICS.group("zernike", Metric("zernike", "nm", "path"))
 def zernike(scene: Scene) -> dict[str, float]:
-    """Return annular Zernike terms (Noll) at the middle wavelength of each field whose annulus reaches the detector.
+    """Return annular Zernike terms (Noll) at the middle wavelength of each field where enough of the pupil is lit.
 
-    DomainError, the reason at the last field, if none does.
+    DomainError, the reason at the last field, if none is.
     """
     metrics: dict[str, float] = {}
     missed: DomainError | None = None

@@ -16,7 +16,7 @@ import typer
 from pachon.commands import cli, config_kinds
 from pachon.commands.cli import main
 from pachon.design.analyses.spot_matrix import spot_matrix
-from pachon.design.metrics.field_zernikes import FittedPupil
+from pachon.design.metrics.field_zernikes import PupilToFit
 from pachon.design.optimize.merit_function import MeritName
 from pachon.imaging.config import ImageConfig
 from pachon.imaging.image_formats.load import WeightName
@@ -216,7 +216,7 @@ def test_help_at_80_columns_is_not_cut_and_has_no_types_of_python(name, capsys, 
         ("spots", "--sampling", SamplingName),
         ("spots", "--projection", Projection),
         ("spots", "--aiming", Aiming),
-        ("zernikes", "--pupil", FittedPupil),
+        ("zernikes", "--pupil", PupilToFit),
         ("spot-matrix", "--against", inspect.signature(spot_matrix, eval_str=True).parameters["against"].annotation),
         ("optimize", "--merit", MeritName),
         ("convert", "--format", LensFormat),

@@ -114,6 +114,9 @@ def test_analyses_of_one_wavelength_take_the_primary_one_of_a_lens_file(request)
     assert np.array_equal(
         pachon.design.seidel_diagram(lens).coefficients, pachon.design.seidel_diagram(lens, primary).coefficients
     )
+    [zernikes] = [s for s in sections.SECTIONS if s.title == "Wavefront in Zernike terms"]
+    figure = zernikes.draw(sections.Where(lens, None, None, 1))
+    assert f"{primary * 1e9:.4g} nm" in figure.get_suptitle()
     found, given = (pachon.design.relative_illumination(lens, wavelength=w, n_pupil=256) for w in (None, primary))
     assert np.array_equal(found.solid_angle, given.solid_angle)
 

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import pachon
 from pachon.core.errors import ConfigError, DomainError
 from pachon.core.plotting import png_bytes
 from pachon.design.metrics.field_zernikes import double_zernikes, wavefront_zernikes
@@ -122,8 +123,23 @@ def test_summaries_and_pictures(lsst_r):
     assert np.shape(table.summary()["double_zernike_nm"]) == (6, 11)
 
 
+def test_the_lit_part_is_fitted_where_stopped_rays_have_no_smooth_wavefront(lsst_r):
+    edge = np.deg2rad([[0.0, 0.0], [0.0, 1.75]])
+    whole, auto = (wavefront_zernikes(lsst_r, edge, jmax=11, pupil=p) for p in ("full", "auto"))
+    assert auto.pupil == "full"
+    assert np.array_equal(auto.coefficients, whole.coefficients)
+    hsc = pachon.load_telescope("hsc")
+    inside = np.deg2rad([[0.0, 0.0], [0.0, 0.64]])
+    auto, lit = wavefront_zernikes(hsc, inside, jmax=11), wavefront_zernikes(hsc, inside, jmax=11, pupil="lit")
+    assert auto.pupil == "lit"
+    assert np.array_equal(auto.coefficients, lit.coefficients)
+    # Through its stopped rays the second field would have 34 waves.
+    assert wavefront_zernikes(hsc, inside, jmax=11, pupil="full").residual_rms[1] > 5e-6
+    assert auto.residual_rms.max() < 2e-7
+
+
 def test_bad_input_is_refused(lsst_r, paraboloid):
-    with pytest.raises(ConfigError, match="pupil = 'half': expected one of full, lit"):
+    with pytest.raises(ConfigError, match="pupil = 'half': expected one of auto, full, lit"):
         wavefront_zernikes(lsst_r, pupil="half")
     with pytest.raises(DomainError, match="jmax = 0: expected a whole number of at least 1"):
         wavefront_zernikes(lsst_r, jmax=0)
