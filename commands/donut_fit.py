@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.errors import ConfigError, DomainError, PachonError, ProductError
+from ..core.files import path_beside
 from .donut_inputs import DonutInputs, StampFiles, donut_inputs
 from .donut_options import DEFAULT_TELESCOPE
 from .options import wavelength_list
@@ -174,8 +175,7 @@ def _focused(options: TelescopeOptions, header: HeaderValues, file: Path) -> Tel
     from ..sensing.stamp_headers import TELESCOPE_KEY
 
     try:
-        beside = None if header.telescope is None else file.parent / header.telescope
-        named = header.model if beside is None or not beside.is_file() else str(beside)
+        named = header.model if header.telescope is None else path_beside(file.parent, header.telescope)
         return options.load(named or DEFAULT_TELESCOPE)[1]
     except PachonError as error:
         if options.telescope is not None or header.telescope is None:

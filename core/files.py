@@ -226,6 +226,12 @@ def parsing(path: str | os.PathLike[str], problem: str, error: type[PachonError]
         raise error(f"{problem} ({reason})", file=path) from None
 
 
+def path_beside(folder: Path, name: str) -> str:
+    """Return the absolute path of a file that a name means from a folder on; the name where there is none."""
+    path = folder / name
+    return str(path.resolve()) if path.is_file() else name
+
+
 def require_file(path: Path, error: type[PachonError]) -> None:
     """Raise `error` where a path is not that of a regular file: a pipe or device would be read without end."""
     try:

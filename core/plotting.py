@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -143,6 +144,18 @@ def _draw_once(figure: Figure, buffer: io.BytesIO, dpi: int) -> None:
     finally:
         figure.dpi = before
         figure.set_canvas(canvas)
+
+
+def symlog_scale(axes: Axes, linear: float) -> None:
+    """Give an axis of values a scale that is logarithmic, and linear about zero up to a power of ten below a value."""
+    # With another threshold a tick would be nearer to zero.
+    axes.set_yscale("symlog", linthresh=10.0 ** math.floor(math.log10(linear)))
+
+
+def round_length(value: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten up to a positive value."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(m * power for m in (5.0, 2.0, 1.0) if m * power <= value * (1 + 1e-9))
 
 
 def png_bytes(figure: Figure) -> bytes:

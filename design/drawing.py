@@ -83,12 +83,6 @@ def finish_axes(axes: Axes, **properties: Any) -> None:
     axes.grid(True, color="0.92", linewidth=0.6)
 
 
-def round_length(value: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten up to a positive value."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return next(m * power for m in (5.0, 2.0, 1.0) if m * power <= value * (1 + 1e-9))
-
-
 def draw_scale_bar(axes: Axes, length: float, label: str) -> None:
     """Draw a bar of a length in data units with its label at the lower left, after the limits are set."""
     x_low, x_high = axes.get_xlim()

@@ -165,13 +165,12 @@ def _loaded(path: Path) -> tuple[Bench, DeskState]:
     from dataclasses import replace
 
     from ..core.errors import error_context
+    from ..core.files import path_beside
     from .bench import Bench
     from .state import DeskState
 
     state = DeskState.from_file(path)
-    beside = path.parent / state.model
-    if beside.is_file():
-        state = replace(state, model=str(beside))
+    state = replace(state, model=path_beside(path.parent, state.model))
     with error_context(file=path):
         bench = Bench(state.model)
         return bench, bench.check(state)

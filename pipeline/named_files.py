@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import ConfigError
+from ..core.files import path_beside
 from ..core.yaml_reader import read_mapping
 
 #: Sections and keys of a configuration that may name a file.
@@ -39,6 +40,6 @@ def with_named_files(content: Any, folder: Path) -> Any:
 
 def with_path(section: Any, key: str, folder: Path) -> Any:
     """Return a section with the absolute path of a file that a key names relative to a folder."""
-    if isinstance(section, dict) and isinstance(section.get(key), str) and (folder / section[key]).is_file():
-        return {**section, key: str((folder / section[key]).resolve())}
+    if isinstance(section, dict) and isinstance(section.get(key), str):
+        return {**section, key: path_beside(folder, section[key])}
     return section

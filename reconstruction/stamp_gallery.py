@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..core.plotting import round_length
 from ..core.units import ARCSEC
 
 if TYPE_CHECKING:
@@ -44,8 +45,7 @@ class StampGallery:
         for row, name in enumerate(names):
             y = self._down * row + 0.5 * side
             axes.text(-0.06 * side, y, name, rotation=90, ha="right", va="center")
-        power = 10.0 ** math.floor(math.log10(0.6 * side))
-        length = next((n * power for n in (5.0, 2.0) if n * power < 0.6 * side), power)
+        length = round_length(0.6 * side)
         axes.plot([0.0, length], [bottom - 0.06 * side] * 2, "-", color="0.2", linewidth=1.5)
         axes.text(0.5 * length, bottom - 0.1 * side, f"{length:g} arcsec", ha="center", va="top", fontsize=8)
         axes.set_xlim(-(0.2 if names else 0.02) * side, self._step * columns)

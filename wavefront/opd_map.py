@@ -12,7 +12,7 @@ import numpy as np
 from ..core.arguments import check_arguments
 from ..core.docstrings import Description, described
 from ..core.errors import DomainError
-from ..core.plotting import BLUE, axes_at, figure_at, figure_of, length_unit_of, plain_text, styled
+from ..core.plotting import BLUE, axes_at, figure_at, figure_of, length_unit_of, plain_text, styled, symlog_scale
 from ..core.result import Result
 from ..models.zernike_polynomials import NOLL_NAMES
 
@@ -258,8 +258,7 @@ def _draw_bars(axes: Axes, zernikes: ZernikeFit) -> None:
     axes.set_xlim(1.3, j[-1] + 0.7)
     largest = float(np.abs(zernikes.coefficients[1:]).max()) * 1e9
     # Tilt is often far larger than all other terms; a scale that is linear about zero shows them too.
-    # A power of ten, so that no tick is nearer to zero.
-    axes.set_yscale("symlog", linthresh=10.0 ** np.floor(np.log10(max(largest / 100.0, 1e-3))))
+    symlog_scale(axes, max(largest / 100.0, 1e-3))
     axes.grid(True, axis="y", color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.set(xlabel="Noll index", ylabel="coefficient = rms over the annulus [nm]")

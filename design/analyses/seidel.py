@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.plotting import plain_text
+from ...core.plotting import plain_text, symlog_scale
 from ...core.units import angle as one_angle
 from ...models.first_order import chromatic_sums, seidel_sums
 from ...models.telescope import Telescope
@@ -91,8 +91,8 @@ class SeidelDiagram(Analysis):
         axes.axvline(len(self.names) - 0.5, color="0.3", linewidth=0.9)
         largest = float(np.abs(bars).max())
         if largest > 100.0 * float(np.abs(self.total).max()):
-            # The sums would be too small to be visible. A power of ten, so that no tick is nearer to zero.
-            axes.set_yscale("symlog", linthresh=10.0 ** np.floor(np.log10(max(largest / 1000.0, 1e-9))))
+            # The sums would be too small to be visible.
+            symlog_scale(axes, max(largest / 1000.0, 1e-9))
         names = [*map(plain_text, self.names), "sum"]
         crowded = len(names) > _CROWDED
         axes.set_xticks(

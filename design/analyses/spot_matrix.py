@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.plotting import BLUE
+from ...core.plotting import BLUE, round_length
 from ...core.units import metres, require_count
 from ...models.telescope import Telescope
 from ...raytrace.rays import Projection
@@ -124,7 +124,7 @@ class SpotMatrix(Analysis):
             if i == 0:
                 value = self.columns[c]
                 axes.set_title(f"{value * 1e9:.4g} nm" if self.against == "wavelength" else f"{value * 1e6:+.4g} µm")
-        bar = drawing.round_length(0.7 * half)
+        bar = round_length(0.7 * half)
         drawing.draw_scale_bar(panels[-n], bar, self.image_text(f"{bar:g} µm"))
 
 

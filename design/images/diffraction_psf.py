@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from scipy.ndimage import zoom
 
-from ...core.plotting import figure_at, styled
+from ...core.plotting import figure_at, round_length, styled
 from ...core.units import arcseconds
 from .. import drawing
 from ..result import FieldResult
@@ -165,7 +165,7 @@ class DiffractionPsf(FieldResult):
             for i, (axes, fwhm) in enumerate(zip(panels, self.fwhm, strict=True)):
                 image = _draw_image(axes, self, i, float(fwhm))
             half = 0.5e6 * self.pixel * self.image.shape[-1]
-            bar = drawing.round_length(0.6 * half)
+            bar = round_length(0.6 * half)
             drawing.draw_scale_bar(panels[0], bar, self.size_text(bar * 1e-6, float(self.plate_scale[0])))
             bar_and_label: Any = (*panels[0].lines, *panels[0].texts)
             for artist in bar_and_label:

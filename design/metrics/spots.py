@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.plotting import BLUE, RED, styled
+from ...core.plotting import BLUE, RED, round_length, styled
 from ...core.units import arcseconds
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
@@ -165,7 +165,7 @@ class SpotDiagram(FieldResult):
             figure, panels = drawing.panel_grid(ax, len(self.fields), 2.5, 3.0)
             for i, axes in enumerate(panels):
                 _draw_spot(axes, self, i, half, radius[i])
-            bar = drawing.round_length(0.7 * half)
+            bar = round_length(0.7 * half)
             drawing.draw_scale_bar(panels[0], bar, self.size_text(bar * 1e-6, float(self.plate_scale[0])))
             for handle in filter(None, drawing.legend_below(figure, panels[0], markerscale=3.0).legend_handles):
                 handle.set_alpha(1.0)

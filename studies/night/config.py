@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,6 +17,7 @@ from pydantic import BeforeValidator, Field
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, ProductError
+from ...core.files import path_beside
 from ...core.schema import Section, Switch, Whole, plain_number, validated
 from ...pipeline.config import Configuration, digest, read_configuration, section_yaml, with_run
 from ...pipeline.experiment import Experiment
@@ -148,10 +149,7 @@ def _site_of(run: Configuration, folder: Path | None) -> str:
     """Return the bundled site of a run's telescope, or the path of a site file."""
     from ...models.io.prescription import load_telescope
 
-    def from_folder(name: str) -> str:
-        path = (folder or Path()) / name
-        return str(path) if path.is_file() else name
-
+    from_folder = partial(path_beside, folder or Path())
     if run.atmosphere.site is not None:
         return from_folder(run.atmosphere.site)
     if run.telescope is None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import ConfigError, unknown_name
+from ...core.files import path_beside
 from ...core.units import angular
 from ...models.io.bundled import BUNDLED
 from ...models.io.prescription import load_telescope, prescription_digest
@@ -84,7 +85,7 @@ def check_telescope_sweep(sweep: SweepFile, parameters: Point, folder: Path) -> 
 
 def telescope_path(name: str, folder: Path) -> str:
     """Return a bundled name as it is, and the path of a file from a folder."""
-    return name if name in BUNDLED or not (folder / name).is_file() else str(folder / name)
+    return name if name in BUNDLED else path_beside(folder, name)
 
 
 @lru_cache(maxsize=64)

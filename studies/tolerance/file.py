@@ -33,6 +33,7 @@ from pydantic import Field
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, error_context
+from ...core.files import path_beside
 from ...core.schema import Count, NotNegative, Positive, Real, Section, Whole, validated
 from ...core.set_keys import set_key_errors, set_keys
 from ...core.yaml_reader import read_mapping
@@ -133,9 +134,9 @@ def load_tolerances(
         telescope_name = file.telescope if telescope is None else telescope
         if not telescope_name:
             raise ConfigError("telescope is missing: expected a name or a file")
-        changed = {"telescope": _beside(path, telescope_name) if telescope is None else telescope_name}
+        changed = {"telescope": path_beside(path.parent, telescope_name) if telescope is None else telescope_name}
         if file.degrees_of_freedom is not None:
-            changed["degrees_of_freedom"] = _beside(path, file.degrees_of_freedom)
+            changed["degrees_of_freedom"] = path_beside(path.parent, file.degrees_of_freedom)
         changed_file = file.model_copy(update=changed)
         _check(changed_file)
     return changed_file
@@ -157,8 +158,3 @@ def _check(file: ToleranceFile) -> None:
         raise ConfigError(f"frequency_per_mm = {file.frequency_per_mm}: expected with merit mtf, and only there")
     if file.method != "traced" and file.merit not in ("spots", "wavefront"):
         raise ConfigError(f"method = {file.method!r}: expected 'traced' for the merit {file.merit}")
-
-
-def _beside(path: Path, name: str) -> str:
-    """Return the path of a file that a name means relative to the folder of another; else the name."""
-    return str((path.parent / name).resolve()) if (path.parent / name).is_file() else name
