@@ -30,6 +30,8 @@ from .shapes.sum import Sum
 from .surface import Interaction, Matrix, Surface, Vector, move_frame
 
 VACUUM = ConstantIndex(1.0)
+#: Sine of the least angle between the normal of a detector and the telescope's x, of which its own x has a turn.
+_LEAST_ALONG_X = 0.5
 #: Interactions without a change of medium.
 _STAYING = {Interaction.MIRROR: "mirror", Interaction.PASS: "baffle", Interaction.PHASE: "phase screen"}
 
@@ -325,6 +327,15 @@ class Telescope(Pictured):
             return self.design_data.length_unit, self.design_data.unit
         return ("mm", 1e-3) if self.pupil_diameter < 1.0 else ("m", 1.0)
 
+    @property
+    def rotator(self) -> float:
+        """Angle of the detector's axes about its normal, from those that :func:`unturned_axes` has [rad].
+
+        It is the angle of :meth:`with_rotator` where the design's axes are those of the telescope.
+        """
+        axes, across = unturned_axes(self.surfaces[-1]), self.surfaces[-1].matrix[:, 0]
+        return 0.0 if axes is None else math.atan2(float(axes[:, 1] @ across), float(axes[:, 0] @ across))
+
     def with_rotator(self, angle: ArrayLike) -> Telescope:
         """Return the telescope with its camera rotated about the camera's own axis.
 
@@ -417,3 +428,17 @@ class Telescope(Pictured):
                 f"expected within {np.rad2deg(self.field_limit):.6g} deg of the axis for {self.name}"
             )
         return x, y
+
+
+def unturned_axes(detector: Surface) -> np.ndarray | None:
+    """Return the axes of a detector [3, 3] with x as near to the telescope's as a turn about its normal makes it.
+
+    None where the normal is nearer to the telescope's x than 60 deg.
+    """
+    normal = detector.matrix[:, 2]
+    x = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
+    length = np.linalg.norm(x)
+    if length < _LEAST_ALONG_X:
+        return None
+    x /= length
+    return np.stack([x, np.cross(normal, x), normal], axis=1)

@@ -127,11 +127,12 @@ class FocalPlanePsf(ModelFields, Result):
         telescope : Telescope or Instrument, optional
             Telescope as it is believed to be; or an :class:`~pachon.Instrument`, which has wavelengths, the turbulence
             that the fit starts from, pixels, charge diffusion, silicon and jitter too, and the size of drawn images
-            where the stars have no stamps. Without it the model is turbulence, with a step, a slope and ripples of each
-            CCD, and principal components.
+            where the stars have no stamps. Its camera is rotated as that of the stars, where they state an angle and
+            it is not rotated yet. Without it the model is turbulence, with a step, a slope and ripples of each CCD, and
+            principal components.
         focal_plane : FocalPlane or StaticHeights, optional
-            Heights that are known, or learnt from other exposures (:func:`~pachon.fit_static_heights`). By default they
-            are unknown.
+            Heights that are known, or learnt from other exposures
+            (:func:`~pachon.reconstruction.fit_static_heights`). By default they are unknown.
         camera : str or Camera, optional
             By default the telescope's. Without one positions must be lengths on one detector plane.
         weight_fwhm : float or Quantity, optional
@@ -184,7 +185,7 @@ class FocalPlanePsf(ModelFields, Result):
             stamps = believed.stamps
             if catalogue.stamps is not None:
                 stamps = replace(stamps, size=catalogue.stamps.shape[1])
-            instrument = replace(believed, stamps=stamps, weight_fwhm=weight)
+            instrument = replace(believed, stamps=stamps, weight_fwhm=weight).with_rotator(catalogue.rotator)
             _check_pixels(catalogue, instrument)
             heights = height_prior(mosaic, focal_plane, prior.budget)
         stamp_size = Stamps().size if instrument is None else instrument.stamps.size

@@ -42,6 +42,7 @@ from ...wavefront.psf.pupil_means import PupilMeans
 from ...wavefront.psf.stamps import Stamps
 from .covariance import Places
 from .height_series import HeightSeries, level_plane
+from .stars import SAME_ROTATOR
 
 #: Noll terms of the residual wavefront of an exposure, each constant and linear over the field.
 NOLL = tuple(range(4, 12))
@@ -147,6 +148,12 @@ class Instrument:
             stamps,
             positive_angle(weight_fwhm, "weight_fwhm"),
         )
+
+    def with_rotator(self, angle: float | None) -> Instrument:
+        """Return the instrument with its camera rotated by an angle [rad], if it is known and the camera is not yet."""
+        if not angle or abs(self.telescope.rotator) > SAME_ROTATOR:
+            return self
+        return replace(self, telescope=self.telescope.with_rotator(angle))
 
     @property
     def wavelengths(self) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,7 +21,7 @@ from ...core.files import parsing, require_file
 from ...core.number_text import counted
 from ...core.point_plots import draw_points
 from ...core.result import Result
-from ...core.units import ARCSEC, positive_angle, real_array
+from ...core.units import ARCSEC, positive_angle, radians, real_array
 from ...measure.shapes import Shapes, measure_shapes
 from ..ccd_product import CcdProduct, ObservedStars, read_product
 from .covariance import Places
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 #: Noise of e1, e2 and ln size times the S/N, of stars as wide as the weight, where no stamps are given.
 NOISE_PER_SNR = (0.50, 0.50, 0.52)
+#: Difference of angles of a rotator that are the same [rad].
+SAME_ROTATOR = 1e-6
 # Relative difference of weights that are the same.
 _SAME_WEIGHT = 1e-6
 # Pixels of the mean star that are changed at a time: of all at once, wide stamps would fill the memory.
@@ -82,6 +84,8 @@ class FocalPlaneStars(Result):
         Weight of the moments [rad].
     pixels : bool
         Whether positions are in pixels.
+    rotator : float or None
+        Angle of the camera from +x towards +y of the telescope frame [rad]; None where it is not known.
     """
 
     _table = ("ccd", "x", "y", "usable")
@@ -96,6 +100,7 @@ class FocalPlaneStars(Result):
     pixel_scale: float | None = None
     weight_fwhm: float = 0.7 * ARCSEC
     pixels: bool = False
+    rotator: float | None = None
 
     def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the places of the stars, coloured by the weighted rms size."""
@@ -149,7 +154,13 @@ class FocalPlaneStars(Result):
             CcdStars(p.name, o.x, o.y, o, o.electrons, p.noise, p.observed_images, o.used)
             for p, o in ((product, product.observed) for product in products)
         ]
-        return cls.of_ccds(ccds, products[0].pixel_scale if products else np.nan, weight_fwhm)
+        stars = cls.of_ccds(ccds, products[0].pixel_scale if products else np.nan, weight_fwhm)
+        angles = sorted({product.rotator for product in products})
+        if angles[-1] - angles[0] > SAME_ROTATOR:
+            raise DomainError(
+                f"rotator: {angles[0]:g} rad in a product, and {angles[-1]:g} rad in another: expected one exposure"
+            )
+        return replace(stars, rotator=angles[0])
 
     @classmethod
     @check_arguments
@@ -252,8 +263,10 @@ class FocalPlaneStars(Result):
             table = Table.read(place, format=kind)
         meta = {str(key).lower(): value for key, value in table.meta.items()}
         of_file = {"weight_fwhm": meta["weight_fwhm"]} if "weight_fwhm" in meta else {}
+        rotator = meta.get("rotator")
         try:
-            return cls.from_table(table, **of_file | options)
+            stars = cls.from_table(table, **of_file | options)
+            return stars if rotator is None else replace(stars, rotator=float(radians(rotator, "rotator")))
         except DomainError as error:
             raise ProductError(error.reason, file=place) from None
 
@@ -261,16 +274,14 @@ class FocalPlaneStars(Result):
     def chosen(self, which: np.ndarray | NDArray[np.bool_]) -> FocalPlaneStars:
         """Return some of the stars, by a mask [n] or indices."""
         index = np.arange(len(self))[which]
-        return FocalPlaneStars(
-            tuple(self.ccd[i] for i in index),
-            self.x[index],
-            self.y[index],
-            self.values[index],
-            self.noise[index],
-            None if self.stamps is None else self.stamps[index],
-            self.pixel_scale,
-            self.weight_fwhm,
-            self.pixels,
+        return replace(
+            self,
+            ccd=tuple(self.ccd[i] for i in index),
+            x=self.x[index],
+            y=self.y[index],
+            values=self.values[index],
+            noise=self.noise[index],
+            stamps=None if self.stamps is None else self.stamps[index],
         )
 
 

@@ -158,7 +158,8 @@ def fit_static_heights(
         Stars of each, as :meth:`.FocalPlanePsf.fit` takes them; paths keep the memory at that of one exposure.
     telescope : Telescope or Instrument
         The telescope; or an :class:`~pachon.Instrument`, which has wavelengths, atmosphere and detector too, and
-        the weight of the moments of tables, which do not say theirs.
+        the weight of the moments of tables, which do not say theirs. Where its camera is not rotated, it is rotated by
+        the angle that the stars of each exposure state.
     camera : str or Camera, optional
         By default the telescope's.
     prior : OpticsPrior, optional
@@ -243,7 +244,7 @@ class _ExposureJob:
         step, number, exposure, state = numbered
         stars = stars_of(exposure)
         stars = stars.chosen(stars.usable)
-        instrument = self._under_weight(stars.weight_fwhm, number)
+        instrument = self._under_weight(stars.weight_fwhm, number).with_rotator(stars.rotator)
         places = places_of(Mosaic.of_camera(self.prior.camera), stars)
         data = ShapeData(places, stars.values, stars.noise**2)
         key = self._key(data, state, instrument)

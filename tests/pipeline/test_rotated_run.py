@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import treecorr
 
+import pachon
+from pachon.core.errors import DomainError
 from pachon.core.long_work import Execution
 from pachon.pipeline import run as run_module
 from pachon.pipeline.config import with_options
@@ -16,6 +18,9 @@ from pachon.pipeline.run_folder import stamp_of
 from pachon.pipeline.simulate.ccd_exposure import expose_positions
 from pachon.pipeline.summary import correlations, separation_bins
 from pachon.reconstruction.ccd_product import product_path, read_product, write_product
+from pachon.reconstruction.focal_plane_psf import model as focal_plane_model
+from pachon.reconstruction.focal_plane_psf import static_heights
+from pachon.reconstruction.focal_plane_psf.response import Instrument
 from pachon.studies.metrics.scene import Scene
 from pachon.studies.sweep.file import read_sweep
 from pachon.studies.sweep.point import point_experiment
@@ -95,6 +100,34 @@ def test_correlations_take_positions_along_the_axes_of_the_ellipticities(finishe
     np.testing.assert_allclose(found.xi_minus[filled], pairs.xim[filled], atol=1e-6 * size)
     plain = correlations(products, ("observed",))["observed"]
     assert np.abs(found.xi_minus - plain.xi_minus)[filled].max() > 0.1 * size
+
+
+def test_models_of_the_focal_plane_rotate_the_camera_as_products_state(finished_run, lsst_r, tmp_path, monkeypatch):
+    """Optics of a camera that was not rotated were fitted to the stars of any run."""
+    products = [read_product(product_path(finished_run, n)) for n in ("R22_S11", "R24_S12")]
+    turned = [dataclasses.replace(p, rotator=0.4) for p in products]
+    stars = pachon.FocalPlaneStars.from_products(turned)
+    stars.write(tmp_path / "stars.ecsv")
+    assert pachon.FocalPlaneStars.read(tmp_path / "stars.ecsv").rotator == pytest.approx(0.4)
+    with pytest.raises(DomainError, match=r"rotator: 0 rad in a product, and 0\.4 rad in another"):
+        pachon.FocalPlaneStars.from_products([products[0], turned[1]])
+    instruments = []
+
+    def noted(*arguments):
+        instruments.extend(a for a in arguments if isinstance(a, Instrument))
+        raise InterruptedError
+
+    monkeypatch.setattr(focal_plane_model, "LEAST_STARS", 20)
+    monkeypatch.setattr(focal_plane_model, "fit_field", noted)
+    monkeypatch.setattr(static_heights, "ExposureFit", noted)
+    already = lsst_r.with_rotator(0.4)
+    for telescope in (lsst_r, already):
+        with pytest.raises(InterruptedError):
+            pachon.FocalPlanePsf.fit(stars, telescope)
+        with pytest.raises(InterruptedError):
+            static_heights.fit_static_heights([stars], telescope)
+    assert [i.telescope for i in instruments] == [already] * 4
+    assert already.rotator == pytest.approx(0.4, abs=1e-15)
 
 
 def test_metrics_of_a_sweep_take_them_too(mean_air):

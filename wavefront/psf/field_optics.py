@@ -28,7 +28,7 @@ from ...core.threads import one_blas_thread
 from ...core.units import field_label
 from ...core.warp_arrays import warp_array
 from ...models.camera.focal_plane import FocalPlane
-from ...models.telescope import Telescope
+from ...models.telescope import Telescope, unturned_axes
 from ...raytrace.aiming import entrance_points
 from ...raytrace.detector import land_on_ccds
 from ...raytrace.launch import launch_bundles
@@ -207,17 +207,13 @@ def _without_rotator(telescope: Telescope) -> tuple[Telescope, float]:
     """
     detector = telescope.surfaces[-1]
     clear = clear_annulus(detector.aperture)
-    normal = detector.matrix[:, 2]
-    x = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
-    if clear is None or any(clear[:2]) or np.linalg.norm(x) < 0.5:
+    axes = unturned_axes(detector)
+    if clear is None or any(clear[:2]) or axes is None:
         return telescope, 0.0
-    x /= np.linalg.norm(x)
-    axes = np.stack([x, np.cross(normal, x), normal], axis=1)
-    angle = math.atan2(axes[:, 1] @ detector.matrix[:, 0], x @ detector.matrix[:, 0])
     # Zeros are positive, so that equal axes are one key.
     first, second, third = ((a + 0.0, b + 0.0, c + 0.0) for a, b, c in axes.tolist())
     unturned = replace(detector, rotation=(first, second, third))
-    return replace(telescope, surfaces=(*telescope.surfaces[:-1], unturned)), angle
+    return replace(telescope, surfaces=(*telescope.surfaces[:-1], unturned)), telescope.rotator
 
 
 # Of a night: six bands, through four pupils.
