@@ -74,7 +74,7 @@ class FieldGrid(NamedTuple):
         """Return that for the moments over a field of a radius [rad]."""
         side = 2.0 * _MARGIN * field_radius
         highest = max(air.altitudes, default=0.0)
-        return cls(_grid_size(side * highest / air.diameter, _SAMPLES), side)
+        return cls(_grid_size(side, highest, air.diameter, _SAMPLES), side)
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,12 +267,17 @@ def _spline_gain(size: int) -> np.ndarray:
     return (1.0 / np.sqrt(mean_square)).astype(np.float32)
 
 
-def _grid_size(pupils: float, samples: float) -> int:
-    """Return an even number of samples with quick transforms, at least so many a pupil; DomainError if too many."""
+def _grid_size(side: float, distance: float, diameter: float, samples: float) -> int:
+    """Return an even number of samples with quick transforms, at least so many a pupil; DomainError if too many.
+
+    The grid has a side [rad], the pupil a diameter [m], and the highest layer is at a distance along the light [m].
+    """
+    pupils = side * distance / diameter
     if samples * pupils > _MOST_SAMPLES:
         raise DomainError(
-            f"engine = 'statistical': the field under the highest layer is {pupils / _MARGIN:.0f} pupils wide; "
-            f"expected at most {_MOST_SAMPLES / samples / _MARGIN:.0f} ('fast' has no such limit)"
+            f"engine = 'statistical': at the highest layer, {1e-3 * distance:.0f} km away along the light, the field is "
+            f"{pupils / _MARGIN:.0f} pupils wide; expected at most {_MOST_SAMPLES / samples / _MARGIN:.0f} (a smaller "
+            "zenith angle has fewer; 'fast' has no such limit)"
         )
     count = max(math.ceil(samples * pupils), _LEAST_SAMPLES)
     return 2 * int(scipy.fft.next_fast_len(-(-count // 2), real=True))
@@ -303,7 +308,7 @@ def _ground_factor(air: ExposedAir) -> np.ndarray:
 def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int, epoch: int) -> SplineFields:
     """Draw the fields of some layers on a common grid of a side [rad]."""
     distance = np.array([air.altitudes[n] for n in layers])
-    size = _grid_size(side * distance.max() / air.diameter, _WAVEFRONT_SAMPLES)
+    size = _grid_size(side, float(distance.max()), air.diameter, _WAVEFRONT_SAMPLES)
     # Of each layer only modes that its Zernikes have.
     reach = np.minimum(np.ceil(_HIGHEST * side * distance / air.diameter).astype(int), size // 2 - 1)
     noise = [
