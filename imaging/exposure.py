@@ -23,7 +23,7 @@ from ..pipeline.simulate.photometry import band_named, sky_electrons_per_pixel
 #: Bit of the mask of a pixel that reaches the full well.
 SATURATED = 1
 #: Names of the bits of the mask, by their value.
-MASK_BITS = {SATURATED: "SATURATED"}
+MASK_BITS = {SATURATED: "SAT"}
 #: Brightest and faintest sky that is taken for one [AB mag/arcsec^2].
 _MOST_MAGNITUDES = 100.0
 #: Rows of a band of the image; each band has its own random stream.

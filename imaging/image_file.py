@@ -15,6 +15,7 @@ from astropy.wcs import WCS
 from ..core.arguments import check_arguments
 from ..core.docstrings import Description
 from ..core.errors import ProductError
+from ..core.mask_planes import plane_card
 from ..core.number_text import counted
 from ..core.plotting import axes_at, plain_text, styled
 from ..core.products import Columns, Stamp, column, read_fits, table_hdu, write_fits
@@ -179,7 +180,7 @@ class CcdImage(Result):
         variance.header["UTYPE"] = "VarianceUncertainty"
         mask = fits.ImageHDU(np.asarray(self.mask, dtype=np.int16), name="MASK")
         for bit, name in self.mask_bits.items():
-            mask.header[f"MP_{name[:5]}"] = (bit.bit_length() - 1, f"number of the bit {name}")
+            mask.header.append(plane_card(name, bit))
         columns: Columns = {key: (values, *OBJECT_COLUMNS[key]) for key, values in self._columns().items()}
         cards = [("CCD", self.name, "name of the CCD")]
         write_fits(Path(path), [image, variance, mask, table_hdu("TRUTH", columns)], self.stamp, cards)

@@ -24,6 +24,7 @@ from astropy.table import Table
 from ..core.errors import ProductError
 from ..core.files import parsing, require_file
 from ..core.fits_files import open_fits
+from ..core.mask_planes import bad_bits
 from ..core.number_text import counted
 from ..core.table_files import text_table
 from .inputs import SMALLEST_STAMP
@@ -47,8 +48,6 @@ _PLANES = {
 }
 #: Kinds of extensions UNCERT of astropy's CCDData by their keyword UTYPE; standard deviations without one.
 _UNCERTAINTIES = {"VarianceUncertainty": "variance", "InverseVariance": "weight"}
-#: Planes of LSST's masks whose pixels have no measured light; its headers number them by MP_<name>.
-_BAD_PLANES = ("BAD", "SAT", "INTRP", "CR", "EDGE", "NO_DATA", "SUSPECT", "UNMASKEDNAN")
 #: Units of the columns that make a table one of stamps or positions; those of columns with other units are converted.
 _COLUMNS = {"field_x": u.deg, "field_y": u.deg, "x": u.pixel, "y": u.pixel, "defocus_um": u.um}
 
@@ -276,7 +275,7 @@ def _with_planes(
             raise ProductError(f"planes of {kind}: {counts}: expected one for each image, as large", file=file)
     out = []
     for k, (header, data) in enumerate(images):
-        own_mask = _bad_pixels(*planes["mask"][k]) if planes["mask"] else np.zeros(data.shape, dtype=bool)
+        own_mask = _bad_pixels(*planes["mask"][k], file) if planes["mask"] else np.zeros(data.shape, dtype=bool)
         own_variance = None
         if planes["variance"]:
             own_variance = np.asarray(planes["variance"][k][1], dtype=np.float64)
@@ -303,13 +302,11 @@ def _kind_of(header: fits.Header) -> str:
     return _UNCERTAINTIES.get(str(header.get("UTYPE", "")).strip(), kind) if kind == "deviation" else kind
 
 
-def _bad_pixels(header: fits.Header, values: np.ndarray) -> np.ndarray:
-    """Return pixels to leave out: bad planes of LSST's masks where the header names planes, else all but 0."""
-    numbers = {c.keyword[3:].upper(): c.value for c in header.cards if c.keyword.upper().startswith("MP_")}
-    if not numbers or values.dtype.kind not in "iu":
+def _bad_pixels(header: fits.Header, values: np.ndarray, path: Path) -> np.ndarray:
+    """Return pixels to leave out: bad planes of masks where the header names planes, else all but 0."""
+    if values.dtype.kind not in "iu":
         return np.asarray(values != 0)
-    bits = sum(1 << int(numbers[name]) for name in _BAD_PLANES if name in numbers)
-    return np.asarray((values.astype(np.int64) & bits) != 0)
+    return np.asarray((values.astype(np.int64) & bad_bits(header, path)) != 0)
 
 
 def _split(image: _Image) -> list[_Image]:

@@ -232,7 +232,7 @@ def _image_of(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -> C
         np.where(bad, 1.0, variance.values).astype(np.float32),
         mask.astype(np.int16),
         header,
-        mask_bits={SATURATED_BIT: "SATURATED", BAD_BIT: "BAD"},
+        mask_bits={SATURATED_BIT: "SAT", BAD_BIT: "BAD"},
         origins=origins,
     )
 

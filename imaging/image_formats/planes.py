@@ -15,17 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.errors import ProductError
+from ...core.mask_planes import HARMLESS, TOO_BRIGHT, bits_of, planes_in
 from ...core.number_text import counted
 from .fits_parts import FitsPart, FitsParts, beside
 
-#: Planes of LSST's masks that mark an area or an object, and leave a pixel as good as any.
-_HARMLESS = frozenset(
-    {"DETECTED", "DETECTED_NEGATIVE", "NOT_DEBLENDED", "BRIGHT_OBJECT", "CROSSTALK", "INEXACT_PSF", "SENSOR_EDGE"}
-)
-#: Planes of pixels of a star that is too bright.
-_TOO_BRIGHT = frozenset({"SAT", "SATUR", "SATURATED", "SUSPECT"})
-#: Start of the cards that number the planes of a mask.
-_PLANE_CARD = "MP_"
 #: Bit of saturated pixels in DES's masks (Morganson et al. 2018, PASP 130, 074501).
 _DES_SATURATED = 2
 #: Bit of the haloes of bright stars there, which marks an area.
@@ -145,18 +138,12 @@ def defects_of(values: np.ndarray, part: FitsPart, path: Path) -> Defects:
         if not np.isfinite(values).all() or (values != np.rint(values)).any():
             raise ProductError(f"mask {part.name} has type {values.dtype}: expected whole numbers", file=path)
         values = values.astype(np.int64)
-    planes = {key[len(_PLANE_CARD) :]: part.header[key] for key in part.header if key.startswith(_PLANE_CARD)}
+    planes = planes_in(part.header, path)
     if planes:
         bits = values.astype(np.int64)
-        bright = _bits(planes, _TOO_BRIGHT)
-        harmless = _bits(planes, _HARMLESS) | bright
-        return Defects((bits & bright) != 0, (bits & ~np.int64(harmless)) != 0)
+        saturated = (bits & bits_of(planes, TOO_BRIGHT)) != 0
+        return Defects(saturated, (bits & bits_of(planes, planes.keys() - HARMLESS - TOO_BRIGHT)) != 0)
     if part.name == "MSK":
         bits = values.astype(np.int64)
         return Defects((bits & _DES_SATURATED) != 0, (bits & ~np.int64(_DES_SATURATED | _DES_STAR)) != 0)
     return Defects(np.zeros(values.shape, dtype=bool), values != 0)
-
-
-def _bits(planes: Mapping[str, int], names: frozenset[str]) -> int:
-    """Return the bits of the planes of some names."""
-    return sum(1 << int(number) for name, number in planes.items() if name in names)

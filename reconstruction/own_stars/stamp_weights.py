@@ -8,32 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ...core.errors import ProductError, shown
+from ...core.errors import ProductError
+from ...core.mask_planes import bad_bits
 from ...measure.pixel_masks import bad_pixels
-
-#: Mask planes of LSST and HSC files whose pixels are no data; others, such as DETECTED, say nothing of their quality.
-BAD_PLANES = (
-    "BAD",
-    "CLIPPED",
-    "CR",
-    "CROSSTALK",
-    "EDGE",
-    "INTRP",
-    "ITL_DIP",
-    "NO_DATA",
-    "REJECTED",
-    "SAT",
-    "SENSOR_EDGE",
-    "SPIKE",
-    "STREAK",
-    "SUSPECT",
-    "UNMASKEDNAN",
-    "VIGNETTED",
-)
-# Start of the cards that name mask planes; their value is the number of the bit.
-_PLANE_CARD = "MP_"
-# Bits of a mask of whole numbers of 64 bits, without that of the sign.
-_MOST_BITS = 63
 
 
 def without_weightless(
@@ -54,7 +31,7 @@ def without_weightless(
         [n, ny, nx].
     weights, variances, masks : array or None
         As the stamps: inverse variances; variances, of which zero, negative and not finite ones are no weight; bits, of
-        which all are bad, or those of :data:`BAD_PLANES` where the header names planes (``MP_BAD``).
+        which all are bad, but where the header names planes (``MP_BAD``) those of :data:`~.mask_planes.HARMLESS`.
     header : mapping
         Header of the masks.
     path : Path
@@ -81,27 +58,10 @@ def without_weightless(
     if variances is not None:
         bad |= ~(np.isfinite(variances) & (variances > 0.0))
     if masks is not None:
-        bad |= (masks.astype(np.int64) & _bad_bits(header, path)) != 0
+        bad |= (masks.astype(np.int64) & bad_bits(header, path)) != 0
     if bad.size and bad.all():
         raise ProductError(
             f"no pixel of its {len(stamps)} stamps has weight: {names[0]} is zero, {names[1]} is set, or all are NaN",
             file=path,
         )
     return np.where(bad, np.nan, stamps)
-
-
-def _bad_bits(header: Mapping[str, Any], path: Path) -> np.int64:
-    """Return the bits of bad planes; all of them where the header names none."""
-    planes = {str(key)[len(_PLANE_CARD) :]: header[key] for key in header if str(key).startswith(_PLANE_CARD)}
-    if not planes:
-        return np.int64(-1)
-    bits = 0
-    for name, bit in planes.items():
-        if isinstance(bit, bool) or not isinstance(bit, int) or not 0 <= bit < _MOST_BITS:
-            raise ProductError(
-                f"{_PLANE_CARD}{name} = {shown(bit)}: expected the number of a bit of the mask, 0 to {_MOST_BITS - 1}",
-                file=path,
-                key=f"{_PLANE_CARD}{name}",
-            )
-        bits |= (1 << bit) * (name in BAD_PLANES)
-    return np.int64(bits)

@@ -128,7 +128,7 @@ def load_stars(
         Where a FITS file has none, its first image of three axes is taken.
     weight, mask : str, optional
         Columns of weights (zero for pixels to ignore) and masks (not zero or True for them; where the header has
-        cards such as MP_BAD, the bits of bad planes, :data:`~.stamp_weights.BAD_PLANES`). Where nothing is said,
+        cards such as MP_BAD, the bits of all planes but :data:`~.mask_planes.HARMLESS`). Where nothing is said,
         columns WEIGHT, VIGNET_WEIGHT, VARIANCE, MASK and so on (:data:`OTHER_NAMES`), and images of three axes whose
         EXTNAME is one of these.
     images : str or Path, optional

@@ -206,7 +206,7 @@ def test_astropy_reads_image_uncertainty_mask_and_table(image, tmp_path):
         assert (header["INSTRUME"], header["DETECTOR"]) == ("LSSTCam", 94)
         assert (header["MJD-OBS"], header["DATE-OBS"]) == (51544.5, "2000-01-01T12:00:00.000")
         assert header["DATE-AVG"] == "2000-01-01T12:00:03.000"  # the middle of EXPTIME, all exposures together
-        assert hdus["MASK"].header["MP_SATUR"] == 0
+        assert hdus["MASK"].header["MP_SAT"] == 0
         assert "DATE" not in header
     data = CCDData.read(path, hdu=1, hdu_uncertainty="VARIANCE", hdu_mask="MASK", unit="adu")
     assert (data.data == image.image).all()

@@ -275,9 +275,9 @@ def _grid_size(side: float, distance: float, diameter: float, samples: float) ->
     pupils = side * distance / diameter
     if samples * pupils > _MOST_SAMPLES:
         raise DomainError(
-            f"engine = 'statistical': at the highest layer, {1e-3 * distance:.0f} km away along the light, the field is "
-            f"{pupils / _MARGIN:.0f} pupils wide; expected at most {_MOST_SAMPLES / samples / _MARGIN:.0f} (a smaller "
-            "zenith angle has fewer; 'fast' has no such limit)"
+            f"engine = 'statistical': at the highest layer, {1e-3 * distance:.0f} km away along the light, the field "
+            f"is {pupils / _MARGIN:.0f} pupils wide; expected at most {_MOST_SAMPLES / samples / _MARGIN:.0f} (a "
+            "smaller zenith angle has fewer; 'fast' has no such limit)"
         )
     count = max(math.ceil(samples * pupils), _LEAST_SAMPLES)
     return 2 * int(scipy.fft.next_fast_len(-(-count // 2), real=True))
