@@ -1,10 +1,14 @@
 """The bundled telescopes against batoid: landing points, optical paths, wavefronts, and which rays are blocked."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import pachon
 from pachon.models.io.bundled import BUNDLED
+from pachon.models.io.glass_search import find_glass
+from pachon.models.media.tabulated import TabulatedIndex
 from pachon.raytrace.rays import RayStatus
 
 batoid = pytest.importorskip("batoid")
@@ -36,6 +40,43 @@ def optic_of(name):
     return optic
 
 
+#: Indices of batoid's tables for HSC, between whose wavelengths it draws straight lines.
+HSC_INDICES = {
+    "silica": (1.47009272, 1.45801158, 1.45421013, 1.45172729, 1.44917721),
+    "BSL7Y": (1.53123287, 1.51671428, 1.51225242, 1.50939738, 1.50653251),
+    "PBL1Y": (1.57046066, 1.54784671, 1.54157395, 1.53789058, 1.53457169),
+}
+HSC_WAVELENGTHS = (0.4e-6, 0.6e-6, 0.75e-6, 0.9e-6, 1.1e-6)
+
+
+def telescope_of(name):
+    """Return the bundled telescope, HSC with batoid's glasses."""
+    telescope = pachon.load_telescope(name)
+    if name != "hsc":
+        return telescope
+    surfaces = []
+    for surface in telescope.surfaces:
+        if (glass := surface.medium_after).name in HSC_INDICES:
+            indices = HSC_INDICES[glass.name]
+            np.testing.assert_allclose(glass.index(HSC_WAVELENGTHS), indices, atol=3e-10)
+            table = TabulatedIndex(HSC_WAVELENGTHS, indices, interpolation="linear", name=glass.name)
+            surface = replace(surface, medium_after=table)
+        surfaces.append(surface)
+    return replace(telescope, surfaces=tuple(surfaces))
+
+
+def test_glasses_of_hsc_have_the_dispersion_of_their_kind():
+    """Indices of melts, in cold air; straight lines were off by 4e-3."""
+    wavelengths = np.linspace(0.4e-6, 1.1e-6, 50)
+    media = {s.medium_after.name: s.medium_after for s in pachon.load_telescope("hsc").surfaces}
+    for name, bound in (("silica", 1e-5), ("BSL7Y", 2.5e-5), ("PBL1Y", 1.2e-4)):
+        catalogue = pachon.load_telescope("lsst_v3.3_r").surface("L1_entrance").medium_after
+        if name != "silica":
+            catalogue = find_glass(name, makers=("ohara",))
+        difference = media[name].index(wavelengths) - catalogue.index(wavelengths)
+        assert np.ptp(difference) < bound, name
+
+
 def fields_of(telescope):
     """Return the centre of the field, a place half-way and two at its rim, in no special direction."""
     radius = telescope.field_radius
@@ -59,7 +100,7 @@ def test_every_bundled_telescope_has_a_peer():
 
 @pytest.mark.parametrize("name", PEERS)
 def test_rays_land_where_batoids_do_and_are_blocked_where_they_are(name):
-    telescope, optic = pachon.load_telescope(name), optic_of(name)
+    telescope, optic = telescope_of(name), optic_of(name)
     rng = np.random.default_rng(4)
     for wavelength in (PEERS[name][1] * 1e-9, telescope.default_wavelength, PEERS[name][2] * 1e-9):
         for field in fields_of(telescope):
@@ -77,7 +118,7 @@ def test_rays_land_where_batoids_do_and_are_blocked_where_they_are(name):
 
 @pytest.mark.parametrize("name", PEERS)
 def test_wavefronts_are_batoids(name):
-    telescope, optic = pachon.load_telescope(name), optic_of(name)
+    telescope, optic = telescope_of(name), optic_of(name)
     wavelength = telescope.default_wavelength
     size = 20
     # batoid's even grid of n points: spacing D / (n - 2), from -n/2 steps.
