@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.errors import ConfigError, DomainError, PachonError, ProductError
-from ..core.files import path_beside
 from .donut_inputs import DonutInputs, StampFiles, donut_inputs
 from .donut_options import DEFAULT_TELESCOPE
 from .options import wavelength_list
@@ -172,6 +171,7 @@ def oriented(fit: DonutFit) -> np.ndarray:
 
 def _focused(options: TelescopeOptions, header: HeaderValues, file: Path) -> Telescope:
     """Return the telescope in focus: of the option, or of the header of a file."""
+    from ..core.files import path_beside
     from ..sensing.stamp_headers import TELESCOPE_KEY
 
     try:

@@ -37,6 +37,9 @@ FittedPupil = Literal["full", "lit"]
 #: The same, or whichever has a smooth wavefront.
 PupilToFit = Literal["auto", "full", "lit"]
 ZernikeOrdering = Literal["noll", "fringe"]
+#: Least over greatest singular value of terms that points tell apart: where 4 % of HSC's pupil are lit, 28 terms have
+#: 3e-11, and coefficients of 10 cm.
+_SEPARATED = 1e-5
 #: Maps of single terms in one plot.
 _MAPS = 8
 #: Terms by which it is found whether the wavefront of the whole annulus is one of Zernikes.
@@ -244,7 +247,8 @@ def wavefront_zernikes(
     ConfigError
         If pupil or ordering is unknown.
     DomainError
-        If there are fewer points than terms, or rays of the full annulus do not reach the detector.
+        If there are fewer points than terms, rays of the full annulus do not reach the detector, or where light passes
+        the terms cannot be told apart.
     """
     request = Request.of(
         telescope,
@@ -388,7 +392,14 @@ def _fit(
         coefficients[complete] = np.linalg.solve(triangle, (value[complete] * root @ orthogonal).T).T
     for i in np.flatnonzero(~complete):
         lit = used[i]
-        coefficients[i], *_ = np.linalg.lstsq(terms[lit] * root[lit, None], value[i, lit] * root[lit], rcond=None)
+        coefficients[i], _, _, size = np.linalg.lstsq(
+            terms[lit] * root[lit, None], value[i, lit] * root[lit], rcond=None
+        )
+        if size[-1] < _SEPARATED * size[0]:
+            raise DomainError(
+                f"{field_label(fields[i])}: light passes at {100.0 * weights[lit].sum() / weights.sum():.2g} % of the "
+                f"pupil, where jmax = {jmax} terms cannot be told apart; expected fewer"
+            )
     residual = np.where(used, value - coefficients @ terms.T, 0.0)
     return coefficients, np.sqrt((residual**2 @ weights) / (used @ weights))
 
