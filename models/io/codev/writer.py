@@ -130,7 +130,7 @@ def _surface_lines(sequence: LensSequence, surface: LensSurface, words: Mapping[
         raise PrescriptionError(f"shape: {FILE} is written with conics and even powers from r^4 on")
     powers = profile.even[1:]
     if len(powers) > len(POWERS):
-        raise PrescriptionError(f"{len(powers)} coefficients: {FILE} has {len(POWERS)}, from r^4 to r^16")
+        raise PrescriptionError(f"{len(powers)} coefficients: {FILE} has {len(POWERS)}, from r^4 to r^20")
     last = surface.interaction == Interaction.DETECTOR
     medium = " REFL" if surface.interaction == Interaction.MIRROR else _medium(surface.after, words)
     head = f"{number_text(profile.radius)} {number_text(sequence.thickness(surface))}"
