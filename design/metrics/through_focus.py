@@ -169,7 +169,9 @@ def through_focus(
     smallest = np.sqrt(np.maximum(np.polynomial.polynomial.polyval(best, square.T, tensor=False), 0.0))
     if defocus is None:
         principal = principal_rays_of(request)
-        blur = max(float(smallest.max()), float((request.wavelengths.mean() * principal.mean_f_number).max()))
+        # Behind a cylinder one of the two focal ratios is infinite, and so is their mean.
+        ratios = np.where(np.isfinite(principal.mean_f_number), principal.mean_f_number, principal.f_number.min(axis=1))
+        blur = max(float(smallest.max()), float((request.wavelengths.mean() * ratios).max()))
         reach = float(np.abs(best - common).max()) + 3.0 * blur / float(np.sqrt(square[:, 2].min()))
         heights = common + reach * np.linspace(-1.0, 1.0, _HEIGHTS)
     else:
