@@ -11,6 +11,9 @@ from ..core.errors import DomainError
 from .surface import Interaction, Vector
 from .telescope import Telescope
 
+#: Distance from an axis, over that along it, which rounding of angles in files makes.
+_ASIDE = 1e-9
+
 
 def front_surface(telescope: Telescope, target: str) -> int:
     """Return the index of the surface in front of the thickness of a surface, or of an element of two.
@@ -37,11 +40,28 @@ def front_surface(telescope: Telescope, target: str) -> int:
 def light_axis(telescope: Telescope, index: int) -> np.ndarray:
     """Return the unit vector along the axis of a surface in the direction of the light behind it, shape [3].
 
-    Light comes along -z of the first surface, and each mirror turns it back.
+    Light comes along -z of the first surface, and each mirror turns it back. Behind a fold mirror, whose own axis is
+    that of nothing, it is the axis in front of it after reflection, where the next vertex lies on that.
     """
+    surface, following = telescope.surfaces[index], telescope.surfaces[index + 1 :]
     mirrors = sum(s.interaction == Interaction.MIRROR for s in telescope.surfaces[: index + 1])
-    axis: np.ndarray = telescope.surfaces[index].matrix[:, 2]
-    return axis if mirrors % 2 else -axis
+    axis: np.ndarray = surface.matrix[:, 2]
+    axis = axis if mirrors % 2 else -axis
+    if surface.interaction != Interaction.MIRROR:
+        return axis
+    offsets = (np.subtract(s.vertex, surface.vertex) for s in following)
+    ahead = next((offset for offset in offsets if offset.any()), axis)
+    if _is_along(ahead, axis):
+        return axis
+    incoming = light_axis(telescope, index - 1) if index else np.array([0.0, 0.0, -1.0])
+    reflected: np.ndarray = incoming - 2.0 * (incoming @ axis) * axis
+    return reflected if _is_along(ahead, reflected) else axis
+
+
+def _is_along(offset: np.ndarray, axis: np.ndarray) -> bool:
+    """Return whether an offset [m] is along a unit vector, either way."""
+    aside = offset - (offset @ axis) * axis
+    return float(np.linalg.norm(aside)) <= _ASIDE * float(np.linalg.norm(offset))
 
 
 def thickness(telescope: Telescope, index: int) -> float:
