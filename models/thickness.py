@@ -11,8 +11,11 @@ from ..core.errors import DomainError
 from .surface import Interaction, Vector
 from .telescope import Telescope
 
-#: Distance from an axis, over that along it, which rounding of angles in files makes.
-_ASIDE = 1e-9
+#: Distance of the next vertex from the reflected axis of a fold mirror, over that from its own axis, at most. It is 1
+#: of a mirror that is out of alignment, and 0 of a fold that is in alignment.
+_OF_FOLDS = 0.5
+#: Cosine of the angle between the axis of a mirror and that of its light from which it is no fold.
+_UPRIGHT = 1.0 - 1e-12
 
 
 def front_surface(telescope: Telescope, target: str) -> int:
@@ -51,17 +54,24 @@ def light_axis(telescope: Telescope, index: int) -> np.ndarray:
         return axis
     offsets = (np.subtract(s.vertex, surface.vertex) for s in following)
     ahead = next((offset for offset in offsets if offset.any()), axis)
-    if _is_along(ahead, axis):
+    aside = _distance_from(axis, ahead)
+    if aside == 0.0:
         return axis
     incoming = light_axis(telescope, index - 1) if index else np.array([0.0, 0.0, -1.0])
     reflected: np.ndarray = incoming - 2.0 * (incoming @ axis) * axis
-    return reflected if _is_along(ahead, reflected) else axis
+    return reflected if _distance_from(reflected, ahead) < _OF_FOLDS * aside else axis
 
 
-def _is_along(offset: np.ndarray, axis: np.ndarray) -> bool:
-    """Return whether an offset [m] is along a unit vector, either way."""
-    aside = offset - (offset @ axis) * axis
-    return float(np.linalg.norm(aside)) <= _ASIDE * float(np.linalg.norm(offset))
+def is_fold(telescope: Telescope, index: int) -> bool:
+    """Return whether a surface, by its index, is a mirror that leads the light from its own axis to the next vertex."""
+    if telescope.surfaces[index].interaction != Interaction.MIRROR:
+        return False
+    return abs(light_axis(telescope, index) @ telescope.surfaces[index].matrix[:, 2]) < _UPRIGHT
+
+
+def _distance_from(axis: np.ndarray, offset: np.ndarray) -> float:
+    """Return the distance [m] of a point at an offset from a line along a unit vector."""
+    return float(np.linalg.norm(offset - (offset @ axis) * axis))
 
 
 def thickness(telescope: Telescope, index: int) -> float:

@@ -43,7 +43,9 @@ def telescope_to_codev(telescope: Telescope, *, lenient: bool = False) -> str:
     coatings and formulas of glasses are left out with a warning.
     """
     # CODE V's chief rays pass the middle of the stop.
-    sequence = LensSequence.of(telescope, FILE, tuple(UNITS), aimed="paraxial", lenient=lenient, afocal=True)
+    sequence = LensSequence.of(
+        telescope, FILE, tuple(UNITS), aimed="paraxial", lenient=lenient, afocal=True, straight=True
+    )
     with error_context(subject=telescope.name):
         names = sequence.glass_names("a private glass, a table of indices", "_", stated_maker=True)
         words = {medium: _glass_word(medium, name) for medium, name in names.items()}

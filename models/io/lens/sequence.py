@@ -76,24 +76,32 @@ class LensSequence:
         lenient: bool = False,
         along_light: bool = False,
         afocal: bool = False,
+        straight: bool = False,
     ) -> LensSequence:
         """Return the surfaces and data of a telescope for a kind of `file`, as its name is said in messages.
 
         `units` are the units of length [m] that it may have, `aimed` is the aiming of its program. With `along_light`
         local z axes are along the light in front of an even number of mirrors, against it in front of an odd one.
-        With `afocal` it can say that the image is at infinity.
+        With `afocal` it can say that the image is at infinity; with `straight` distances are those along the axis of
+        the object space, behind folds too.
         PrescriptionError for a telescope that no file of a sequence of surfaces can hold, and unless lenient, which
         makes it a warning, for links and coatings.
         """
-        t, findings = with_true_aperture(require_met(telescope)), Findings(lenient)
-        data = t.design_data
+        by_stop = telescope.design_data.aperture == "stop"
+        t = with_true_aperture(require_met(telescope), straight=straight and not by_stop)
+        data, findings = t.design_data, Findings(lenient)
         with error_context(subject=t.name):
             require_sequential(t, file)
             if data.telecentric:
                 raise PrescriptionError(f"telecentric object space: {file} has no place for it")
             flags = ["afocal"] if data.afocal and not afocal else []
             report_unheld(t, (*data.pickups, *data.solves), file, lenient=lenient, others=flags)
-            own_stop = stop_makes_pupil(t) or (aimed != "off" and stop_states_rays(t))
+            own_stop = stop_makes_pupil(t, straight=straight)
+            if aimed != "off" and not own_stop:
+                # The size of the stop has no place, and is written as the diameter of the entrance pupil.
+                diameter = {"aperture": "entrance_pupil", "aperture_value": t.pupil_diameter}
+                stated = t.with_design(**diameter) if by_stop else t
+                own_stop = stop_states_rays(stated, straight=straight)
             report_pupil_plane(t, findings, own_stop=own_stop, aimed=aimed)
             report_obscuration(t, findings, file)
             if own_stop and data.aiming != aimed:

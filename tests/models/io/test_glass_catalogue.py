@@ -197,7 +197,7 @@ def test_a_binary_file_is_refused(tmp_path):
         GlassCatalogue.read(path)
 
 
-@pytest.mark.parametrize("name, ends", [("CAF2", (0.23, 9.7)), ("E-LAFH3", (0.4, 0.7))])
+@pytest.mark.parametrize(("name", "ends"), [("CAF2", (0.23, 9.7)), ("E-LAFH3", (0.4, 0.7))])
 def test_a_lens_may_have_the_wavelengths_at_the_ends_of_a_glass(tmp_path, name, ends):
     """0.23 / 1e6 is another float than 0.23e-6: the wavelength itself was refused as beyond its glass."""
     lines = ["MODE SEQ", "UNIT MM", "ENPD 5", "FTYP 0 0 1 2", "XFLN 0", "YFLN 0"]

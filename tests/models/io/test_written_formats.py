@@ -179,6 +179,23 @@ def test_a_stop_that_does_not_make_the_pupil_stands_on_a_plane_in_front(tmp_path
     assert_same_rays(telescope, read)
 
 
+@pytest.mark.parametrize("aperture", ["FLOA", "FNUM 12 0"])
+@pytest.mark.parametrize("ending", [".yaml", ".zmx", ".seq", ".len", ".json", ".roa"])
+def test_a_stop_behind_a_fold_keeps_its_pupil(tmp_path, ending, aperture):
+    """Distances along the first axis, in Zemax and CODE V files, made another pupil: 29 mm for 40 of a doublet."""
+    text = (LENSES / "fold.zmx").read_text().replace("  STOP\n", "").replace("FNUM 6 0", aperture)
+    stop = "DISZ -20\nSURF 7\n  STOP\n  TYPE STANDARD\n  CURV 0\n  DIAM 2 1\n  DISZ -25.9\nSURF 8\n"
+    (tmp_path / "fold.zmx").write_text(text.replace("DISZ -45.9\nSURF 7\n", stop))
+    telescope = pachon.load_telescope(tmp_path / "fold.zmx").with_design(aiming="off")
+    assert telescope.design_data.stop == "S7"
+    read = again(telescope, tmp_path / f"again{ending}", lenient=True)
+    assert read.pupil_diameter == pytest.approx(telescope.pupil_diameter, rel=1e-12)
+    assert_same_rays(telescope, read)
+    # Where rays are aimed the stop stays.
+    aimed = again(telescope.with_design(aiming="paraxial"), tmp_path / f"aimed{ending}", lenient=True)
+    assert aimed.design_data.stop == "S7"
+
+
 #: A triplet whose stop is the back of its negative lens; no ray aiming, as is Zemax's default.
 STOP_INSIDE = ROOT / "tests" / "data" / "lensfiles" / "stop_inside.zmx"
 
