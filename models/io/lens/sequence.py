@@ -276,6 +276,7 @@ def lens_surfaces(t: Telescope, stop: str | None, *, along_light: bool = False) 
         against = along_light and sign * float(direction @ axes[:, 2]) < _AGAINST
         aligned, axes = _reversed(surface, axes) if against else (surface, axes)
         position = HALF_TURN @ np.array(surface.vertex) + 0.0
+        screen = surface.interaction == Interaction.DETECTOR and surface is not t.surfaces[-1]
         with error_context(subject=f"surface {surface.name}"):
             if surface.interaction == Interaction.PHASE:
                 raise PrescriptionError("phase screens cannot be written")
@@ -285,7 +286,8 @@ def lens_surfaces(t: Telescope, stop: str | None, *, along_light: bool = False) 
                 position,
                 axes,
                 name=" ".join(surface.name.split()),
-                interaction=surface.interaction,
+                # A detector in front of others has no place in lens files; the light passes it there too.
+                interaction=Interaction.PASS if screen else surface.interaction,
                 before=medium,
                 after=surface.medium_after,
                 aperture=None if aligned.aperture is None else rotated_aperture(aligned.aperture),

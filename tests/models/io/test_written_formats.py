@@ -20,6 +20,7 @@ from pachon.models.media.tabulated import TabulatedIndex
 from pachon.models.shapes.freeform import Toroid
 from pachon.models.shapes.polynomial import XYPolynomial, ZernikeSag
 from pachon.models.shapes.sum import Sum
+from pachon.models.surface import Interaction
 
 ROOT = Path(__file__).parents[3]
 LENSES = ROOT / "tests" / "data" / "lenses"
@@ -194,6 +195,23 @@ def test_a_stop_behind_a_fold_keeps_its_pupil(tmp_path, ending, aperture):
     # Where rays are aimed the stop stays.
     aimed = again(telescope.with_design(aiming="paraxial"), tmp_path / f"aimed{ending}", lenient=True)
     assert aimed.design_data.stop == "S7"
+
+
+@pytest.mark.parametrize("ending", [".zmx", ".seq", ".len", ".json", ".roa"])
+def test_a_detector_in_front_of_others_is_a_plane_that_the_light_passes(tmp_path, ending):
+    """It ended the glass that it stands in, and a ray-optics file had a gap too few to be read."""
+    telescope = pachon.load_telescope(LENSES / "fold.zmx").with_design(aiming="paraxial")
+    pachon.save_telescope(telescope, tmp_path / "fold.yaml")
+    text = (tmp_path / "fold.yaml").read_text()
+    place = text.index("  - {name: ", text.index("{name: crown"))
+    monitor = "  - {name: monitor, type: detector, shape: plane, z: -0.002}\n"
+    (tmp_path / "fold.yaml").write_text(text[:place] + monitor + text[place:])
+    telescope = pachon.load_telescope(tmp_path / "fold.yaml")
+    assert telescope.surfaces[1].interaction == Interaction.DETECTOR
+    read = again(telescope, tmp_path / f"again{ending}", lenient=True)
+    assert len(read.surfaces) == len(telescope.surfaces)
+    assert [s.interaction for s in read.surfaces].count(Interaction.DETECTOR) == 1
+    assert_same_rays(telescope, read)
 
 
 #: A triplet whose stop is the back of its negative lens; no ray aiming, as is Zemax's default.
