@@ -57,8 +57,11 @@ def light_axis(telescope: Telescope, index: int) -> np.ndarray:
     aside = _distance_from(axis, ahead)
     if aside == 0.0:
         return axis
-    incoming = light_axis(telescope, index - 1) if index else np.array([0.0, 0.0, -1.0])
-    reflected: np.ndarray = incoming - 2.0 * (incoming @ axis) * axis
+    # A lens may stand in the light that a grating has turned, a tilted plate may not: the mirror in front of it tells.
+    front_mirrors = (i for i in range(index)[::-1] if telescope.surfaces[i].interaction == Interaction.MIRROR)
+    lights = {index - 1, next(front_mirrors, -1)}
+    incoming = (light_axis(telescope, i) if i >= 0 else np.array([0.0, 0.0, -1.0]) for i in sorted(lights))
+    reflected = min((v - 2.0 * (v @ axis) * axis for v in incoming), key=lambda v: _distance_from(v, ahead))
     return reflected if _distance_from(reflected, ahead) < _OF_FOLDS * aside else axis
 
 

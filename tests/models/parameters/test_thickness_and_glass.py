@@ -1,6 +1,9 @@
 """Thicknesses, indices and Abbe numbers as parameters: motions by hand, closed forms, exact derivatives."""
 
+import re
 from dataclasses import replace
+from itertools import count
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -54,6 +57,19 @@ def test_a_thickness_behind_a_fold_is_along_the_light(model, fold, distance, alo
         assert np.subtract(after.vertex, before.vertex) == pytest.approx(1e-3 * behind * np.array(along), abs=1e-15)
     (velocity,) = twists(telescope, parse_parameters([f"{fold}.thickness"], telescope), np.zeros(1))[:, -1, :3]
     assert velocity == pytest.approx(along, abs=1e-15)
+
+
+def test_a_tilted_plate_turns_no_light_to_a_fold(tmp_path):
+    """The 46 mm behind the fold of the lens were 32, along the normal of the mirror."""
+    turn, plane = "SURF\n  TYPE COORDBRK\n  CURV 0\n  PARM 3 {}\n  DISZ {}\n", "SURF\n  TYPE STANDARD\n  CURV 0\n"
+    plate = turn.format(30, 0) + plane + "  GLAS N-BK7 0 0 1.5 40 0 0 0 0 0 0\n  DISZ 2\n" + plane + "  DISZ 0\n"
+    text = Path("tests/data/lenses/fold.zmx").read_text()
+    text = text.replace("DISZ 50\n", f"DISZ 30\n{plate}{turn.format(-30, 18)}")
+    numbers = count()
+    (tmp_path / "plate.zmx").write_text(re.sub(r"SURF( \d+)?", lambda _: f"SURF {next(numbers)}", text))
+    telescope = pachon.load_telescope(tmp_path / "plate.zmx")
+    assert len(telescope.surfaces) == 7
+    assert Parameter.parse("fold.thickness", telescope).value(telescope) == pytest.approx(0.0459, rel=1e-12)
 
 
 def test_a_misaligned_mirror_keeps_its_own_axis(lsst_r):
