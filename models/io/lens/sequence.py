@@ -179,13 +179,18 @@ class LensSequence:
         assert surface.aperture is not None
         report_aperture(surface.name, surface.aperture, self.file, expected, self.findings)
 
-    def stated_aperture(self, kinds: Collection[str]) -> tuple[str, float]:
-        """Return the aperture, of one of some kinds; if lenient the diameter of the entrance pupil [m] for another."""
+    def stated_aperture(
+        self, kinds: Collection[str], instead: str = "diameter of the entrance pupil"
+    ) -> tuple[str, float]:
+        """Return the aperture, of one of some kinds; if lenient the diameter of the entrance pupil [m] for another.
+
+        `instead` is what it is written as.
+        """
         if self.aperture[0] in kinds:
             return self.aperture
         aperture_name = self.aperture[0].replace("_", " ")
         text = f"aperture = {aperture_name}: {self.file} has no place for it"
-        self.leave_out(text, "written as the diameter of the entrance pupil")
+        self.leave_out(text, f"written as the {instead}")
         return "entrance_pupil", self.telescope.pupil_diameter
 
     def glass_names(self, table: str, forbidden: str = "", *, stated_maker: bool = False) -> Mapping[Medium, str]:
