@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,12 +24,12 @@ class Coating:
     efficiencies : tuple of float, shape (n,)
         Reflectivity or transmission, 0 to 1.
     name : str
-        Name for messages.
+        Name for messages and files; not part of equality.
     """
 
     wavelengths: tuple[float, ...]
     efficiencies: tuple[float, ...]
-    name: str = ""
+    name: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
         check_wavelengths(self.wavelengths, self.name)

@@ -13,7 +13,7 @@ Without films this is Fresnel's transmission. Both polarisations are averaged.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -80,13 +80,13 @@ class CoatingTable:
     efficiencies : tuple of tuple of float, shape (n, m)
         Reflectivity or transmission, 0 to 1; interpolated linearly along both.
     name : str
-        Name for messages.
+        Name for messages and files; not part of equality.
     """
 
     wavelengths: tuple[float, ...]
     angles: tuple[float, ...]
     efficiencies: tuple[tuple[float, ...], ...]
-    name: str = ""
+    name: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
         name = self.name or "a coating"
@@ -136,7 +136,7 @@ class LayerStack:
     thicknesses : tuple of float
         Their thicknesses [m].
     name : str
-        Name for messages.
+        Name for messages and files; not part of equality.
 
     Raises
     ------
@@ -146,7 +146,7 @@ class LayerStack:
 
     indices: tuple[float, ...]
     thicknesses: tuple[float, ...]
-    name: str = ""
+    name: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
         values = np.array([*self.indices, *self.thicknesses])

@@ -21,6 +21,7 @@ from .media.medium import Medium
 from .parabasal import stop_center_point
 from .surface import Interaction, Surface
 from .telescope import Telescope
+from .thickness import is_fold
 
 #: Height at the stop, over that of a ray from its middle, below which the entrance pupil is at infinity.
 _NO_IMAGE = 1e-9
@@ -29,8 +30,6 @@ _ROUNDING = 1e-12
 #: Largest radius of a reference sphere [m]; paths to a sphere that large are those to a plane, to 1e-10 m at a blur of
 #: a millimetre.
 _LARGEST_SPHERE = 1e4
-#: Cosine of the angle between an axis of a surface and that of the telescope below which the light is folded.
-_FOLDED = 0.9
 #: Smallest radius of a reference sphere, over the diameter of the entrance pupil.
 _SMALLEST_SPHERE = 1e-2
 
@@ -50,33 +49,37 @@ class ParaxialSurfaces:
     _ahead: float = 0.0
 
     @classmethod
-    def of(cls, telescope: Telescope, stop: str, *, front: bool = False, tilted: bool = False) -> ParaxialSurfaces:
+    def of(
+        cls, telescope: Telescope, stop: str, *, front: bool = False, tilted: bool = False, straight: bool = False
+    ) -> ParaxialSurfaces:
         """Return the surfaces of a telescope, with one of them as the stop; DomainError if one is off the axis.
 
         With `front` they end with the stop; with `tilted` they may be off the axis, as for Zemax, and fold mirrors are
-        unfolded.
+        unfolded. With `straight` nothing is: distances are those along z, as of a file whose surfaces all stand on the
+        axis of the object space.
         """
         paraxial, medium = cls(), telescope.medium_before
-        folded = tilted and any(abs(surface.matrix[2, 2]) < _FOLDED for surface in telescope.surfaces)
+        unfolded = tilted and not straight
+        folds = [unfolded and is_fold(telescope, i) for i in range(len(telescope.surfaces))]
         place, axis = np.array(telescope.surfaces[0].vertex), np.array([0.0, 0.0, -1.0])
-        for surface in telescope.surfaces:
+        for surface, fold in zip(telescope.surfaces, folds, strict=True):
             if not tilted:
                 require_on_axis(surface, telescope.name)
             # Counted along the light in front of an even number of mirrors, and against it in front of an odd one.
             ahead = np.array(surface.vertex) - place
-            paraxial.advance(float(axis @ ahead) if folded else -float(ahead[2]))
-            place = place + axis * (axis @ ahead) if folded else np.array(surface.vertex)
+            paraxial.advance(float(axis @ ahead) if any(folds) else -float(ahead[2]))
+            place = place + axis * (axis @ ahead) if any(folds) else np.array(surface.vertex)
             if surface.name == stop:
                 paraxial.mark_stop(0.0)
             mirror = surface.interaction == Interaction.MIRROR
-            sign = math.copysign(1.0, axis @ surface.matrix[:, 2])
-            x, y = curvatures_across(surface)
+            sign = -1.0 if straight else math.copysign(1.0, axis @ surface.matrix[:, 2])
+            x, y = surface.shape.curvatures if straight else curvatures_across(surface)
             lens = surface.thin_lens
             power = 0.0 if lens is None else 1.0 / lens.focal_length
             paraxial.add((sign * x, sign * y), medium, surface.medium_after, mirror=mirror, power=power)
             if front and surface.name == stop:
                 break
-            if mirror and folded:
+            if fold:
                 normal = surface.matrix[:, 2]
                 axis = 2.0 * (axis @ normal) * normal - axis
             medium = surface.medium_after
@@ -209,17 +212,18 @@ class StopImage:
         return distance / (value * cone) if cone else math.inf
 
 
-def stop_image(telescope: Telescope, *, front: bool = False, tilted: bool = False) -> StopImage:
+def stop_image(telescope: Telescope, *, front: bool = False, tilted: bool = False, straight: bool = False) -> StopImage:
     """Return the paraxial image of a telescope's stop at its default wavelength.
 
     With `front` the surfaces behind the stop are left out, and may be off the axis; its image, and the pupil of an
-    aperture that is not a focal ratio, do not depend on them. With `tilted` any surface may be, as for Zemax.
+    aperture that is not a focal ratio, do not depend on them. `tilted` and `straight` are those of
+    :meth:`ParaxialSurfaces.of`.
     DomainError if its design data name no stop, a surface is off the axis, or the image is at infinity.
     """
     data = telescope.design_data
     if data.stop is None:
         raise DomainError(f"{telescope.name}: expected a surface that is the stop (design data: stop)")
-    surfaces = ParaxialSurfaces.of(telescope, data.stop, front=front, tilted=tilted)
+    surfaces = ParaxialSurfaces.of(telescope, data.stop, front=front, tilted=tilted, straight=straight)
     distance = telescope.object_distance - telescope.surfaces[0].vertex[2]
     image = StopImage.of(surfaces, telescope.default_wavelength, distance, telecentric=data.telecentric)
     if image is None:
@@ -251,10 +255,14 @@ def with_floating_pupil(telescope: Telescope) -> Telescope:
     return floating_pupil(telescope)
 
 
-def floating_pupil(telescope: Telescope, *, tilted: bool = False) -> Telescope:
-    """Return :func:`with_floating_pupil`; with `tilted` of surfaces off the axis too, as if they were on it."""
+def floating_pupil(telescope: Telescope, *, tilted: bool = False, straight: bool = False) -> Telescope:
+    """Return :func:`with_floating_pupil`; with `tilted` of surfaces off the axis too, as if they were on it.
+
+    `straight` is that of :meth:`ParaxialSurfaces.of`.
+    """
     data = telescope.design_data
-    image = stop_image(telescope, front=data.aperture not in ("f_number", "working_f_number"), tilted=tilted)
+    front = data.aperture not in ("f_number", "working_f_number")
+    image = stop_image(telescope, front=front, tilted=tilted, straight=straight)
     if data.aperture is None or data.aperture_value is None:
         raise DomainError(f"{telescope.name}: expected an aperture in its design data")
     diameter = image.diameter(data.aperture, data.aperture_value)
@@ -290,24 +298,25 @@ def following_stop(t: Telescope) -> Telescope:
     return t.with_design(aiming="real")
 
 
-def with_moved_pupil(t: Telescope) -> Telescope:
+def with_moved_pupil(t: Telescope, *, straight: bool = False) -> Telescope:
     """Return a changed telescope with its entrance pupil where its stop, inside it, is imaged now.
 
     The diameter of the pupil stays, of an object at a finite distance the angle of the beam; a stated size of the stop
     keeps that. Another aperture that the change made untrue becomes a diameter. As for Zemax, surfaces off the axis
     count as if they were on it. A telescope without such a pupil, or whose stop is not inside, is returned as it is.
+    `straight` is that of :meth:`ParaxialSurfaces.of`.
     """
     data = t.design_data
-    if data.telecentric or not stop_is_inside(t) or stop_makes_pupil(t):
+    if data.telecentric or not stop_is_inside(t) or stop_makes_pupil(t, straight=straight):
         return t
     with suppress(DomainError):
         stated = t
         if data.aperture not in ("stop", "object_na"):
-            height = _pupil_height(t, stop_image(t, front=True, tilted=True))
+            height = _pupil_height(t, stop_image(t, front=True, tilted=True, straight=straight))
             farther = (t.object_distance - height) / (t.object_distance - t.stop_z)
             diameter = t.pupil_diameter * (abs(farther) if math.isfinite(t.object_distance) else 1.0)
             stated = t.with_design(aperture="entrance_pupil", aperture_value=diameter)
-        return floating_pupil(stated, tilted=True)
+        return floating_pupil(stated, tilted=True, straight=straight)
     return t
 
 
@@ -343,12 +352,15 @@ def following_pupil(changed: Telescope, unchanged: Telescope) -> Telescope:
     return moved
 
 
-def stop_makes_pupil(t: Telescope) -> bool:
-    """Return whether stop and aperture are stated, and make the entrance pupil of the telescope."""
+def stop_makes_pupil(t: Telescope, *, straight: bool = False) -> bool:
+    """Return whether stop and aperture are stated, and make the entrance pupil of the telescope.
+
+    `straight` is that of :meth:`ParaxialSurfaces.of`.
+    """
     if t.design_data.stop is None or t.design_data.aperture is None:
         return False
     try:
-        floating = floating_pupil(t, tilted=True)
+        floating = floating_pupil(t, tilted=True, straight=straight)
     except DomainError:
         return False
     close = {"rel_tol": _ROUNDING, "abs_tol": _ROUNDING * t.pupil_diameter}
@@ -356,32 +368,33 @@ def stop_makes_pupil(t: Telescope) -> bool:
     return same_plane and math.isclose(floating.pupil_diameter, t.pupil_diameter, **close)
 
 
-def stop_states_rays(t: Telescope) -> bool:
+def stop_states_rays(t: Telescope, *, straight: bool = False) -> bool:
     """Return whether a lens file that states stop, aperture and ray aiming has the rays of a telescope.
 
     Stop and aperture make its entrance pupil; or they need not, as rays of given angles are aimed at the stop, and the
     aperture is the diameter of their beam. A reader has a place for the pupil then, without effect on the rays.
+    `straight` is that of :meth:`ParaxialSurfaces.of`.
     """
-    if stop_makes_pupil(t):
+    if stop_makes_pupil(t, straight=straight):
         return True
     data = t.design_data
     if data.stop is None or data.aiming == "off" or math.isfinite(t.object_distance) or data.field_type != "angle":
         return False
     if (data.aperture, data.aperture_value) != ("entrance_pupil", t.pupil_diameter):
         return False
-    surfaces = ParaxialSurfaces.of(t, data.stop, tilted=True)
+    surfaces = ParaxialSurfaces.of(t, data.stop, tilted=True, straight=straight)
     return StopImage.of(surfaces, t.default_wavelength, math.inf, telecentric=False) is not None
 
 
-def with_true_aperture(telescope: Telescope) -> Telescope:
+def with_true_aperture(telescope: Telescope, *, straight: bool = False) -> Telescope:
     """Return a telescope of the same rays whose stop and stated aperture make its entrance pupil, where there is one.
 
     A focal ratio that a change has made untrue becomes the diameter of the pupil, which stays. Where rays are aimed at
     the stop, the entrance pupil moves to where the stop is imaged now; elsewhere the plane of the pupil stays, whether
-    or not the stop makes it.
+    or not the stop makes it. `straight` is that of :meth:`ParaxialSurfaces.of`.
     """
     data = telescope.design_data
-    if data.stop is None or data.telecentric or stop_makes_pupil(telescope):
+    if data.stop is None or data.telecentric or stop_makes_pupil(telescope, straight=straight):
         return telescope
     stated = telescope
     if data.aperture in (None, "f_number", "working_f_number", "entrance_pupil"):
@@ -390,19 +403,19 @@ def with_true_aperture(telescope: Telescope) -> Telescope:
     same_fields = math.isinf(telescope.object_distance) or (bool(data.fields) and data.field_type != "angle")
     if data.aiming != "off" and same_fields:
         if stop_is_inside(telescope):
-            stated = with_moved_pupil(stated)
+            stated = with_moved_pupil(stated, straight=straight)
         elif math.isinf(telescope.object_distance):
             # Surfaces off the axis have no such image; the rays do not depend on it.
             with suppress(DomainError):
                 stated = with_floating_pupil(stated)
-    untrue = data.aperture in ("f_number", "working_f_number") and not _states_diameter(telescope)
-    return stated if untrue or stop_states_rays(stated) else telescope
+    untrue = data.aperture in ("f_number", "working_f_number") and not _states_diameter(telescope, straight)
+    return stated if untrue or stop_states_rays(stated, straight=straight) else telescope
 
 
-def _states_diameter(t: Telescope) -> bool:
+def _states_diameter(t: Telescope, straight: bool) -> bool:
     """Return whether the stated aperture makes the diameter of the pupil, or cannot be compared with it."""
     try:
-        floating = floating_pupil(t, tilted=True)
+        floating = floating_pupil(t, tilted=True, straight=straight)
     except DomainError:
         return True
     return math.isclose(floating.pupil_diameter, t.pupil_diameter, rel_tol=_ROUNDING)

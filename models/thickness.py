@@ -11,6 +11,12 @@ from ..core.errors import DomainError
 from .surface import Interaction, Vector
 from .telescope import Telescope
 
+#: Distance of the next vertex from the reflected axis of a fold mirror, over that from its own axis, at most. It is 1
+#: of a mirror that is out of alignment, and 0 of a fold that is in alignment.
+_OF_FOLDS = 0.5
+#: Cosine of the angle between the axis of a mirror and that of its light from which it is no fold.
+_UPRIGHT = 1.0 - 1e-12
+
 
 def front_surface(telescope: Telescope, target: str) -> int:
     """Return the index of the surface in front of the thickness of a surface, or of an element of two.
@@ -37,11 +43,38 @@ def front_surface(telescope: Telescope, target: str) -> int:
 def light_axis(telescope: Telescope, index: int) -> np.ndarray:
     """Return the unit vector along the axis of a surface in the direction of the light behind it, shape [3].
 
-    Light comes along -z of the first surface, and each mirror turns it back.
+    Light comes along -z of the first surface, and each mirror turns it back. Behind a fold mirror, whose own axis is
+    that of nothing, it is the axis in front of it after reflection, where the next vertex lies on that.
     """
+    surface, following = telescope.surfaces[index], telescope.surfaces[index + 1 :]
     mirrors = sum(s.interaction == Interaction.MIRROR for s in telescope.surfaces[: index + 1])
-    axis: np.ndarray = telescope.surfaces[index].matrix[:, 2]
-    return axis if mirrors % 2 else -axis
+    axis: np.ndarray = surface.matrix[:, 2]
+    axis = axis if mirrors % 2 else -axis
+    if surface.interaction != Interaction.MIRROR:
+        return axis
+    offsets = (np.subtract(s.vertex, surface.vertex) for s in following)
+    ahead = next((offset for offset in offsets if offset.any()), axis)
+    aside = _distance_from(axis, ahead)
+    if aside == 0.0:
+        return axis
+    # A lens may stand in the light that a grating has turned, a tilted plate may not: the mirror in front of it tells.
+    front_mirrors = (i for i in range(index)[::-1] if telescope.surfaces[i].interaction == Interaction.MIRROR)
+    lights = {index - 1, next(front_mirrors, -1)}
+    incoming = (light_axis(telescope, i) if i >= 0 else np.array([0.0, 0.0, -1.0]) for i in sorted(lights))
+    reflected = min((v - 2.0 * (v @ axis) * axis for v in incoming), key=lambda v: _distance_from(v, ahead))
+    return reflected if _distance_from(reflected, ahead) < _OF_FOLDS * aside else axis
+
+
+def is_fold(telescope: Telescope, index: int) -> bool:
+    """Return whether a surface, by its index, is a mirror that leads the light from its own axis to the next vertex."""
+    if telescope.surfaces[index].interaction != Interaction.MIRROR:
+        return False
+    return abs(light_axis(telescope, index) @ telescope.surfaces[index].matrix[:, 2]) < _UPRIGHT
+
+
+def _distance_from(axis: np.ndarray, offset: np.ndarray) -> float:
+    """Return the distance [m] of a point at an offset from a line along a unit vector."""
+    return float(np.linalg.norm(offset - (offset @ axis) * axis))
 
 
 def thickness(telescope: Telescope, index: int) -> float:

@@ -16,6 +16,7 @@ from ...core.threads import one_blas_thread
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ...raytrace.rays import Projection
+from ...wavefront.chief_rays import reference_rays
 from ...wavefront.pupil_sampling import PupilSampling, SamplingName
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
@@ -123,7 +124,7 @@ def strehl(
     Raises
     ------
     DomainError
-        If no light of a field passes.
+        If no light of a field passes, or a chief ray does not reach the image.
     """
     request = Request.of(
         telescope, fields, wavelengths, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
@@ -131,6 +132,8 @@ def strehl(
     shape = (len(request.fields), len(request.wavelengths))
     rms, ratio, peak = (np.full(shape, np.nan) for _ in range(3))
     for w, wavelength in enumerate(map(float, request.wavelengths)):
+        # Wavefronts are those about the chief rays, vignetted or not.
+        reference_rays(request, wavelength)
         bundles = request.bundles(wavelength)
         opd = bundles.opd(request.telescope.sphere_radius)
         for i, lit in enumerate(bundles.lit):

@@ -47,6 +47,8 @@ _PARTS = 6
 _HELD = 0.99
 #: Reach of images by default, over the radius that holds that fraction.
 _BEYOND = 1.1
+#: Range of cosines along one axis over that along the other which is rounding.
+_ROUNDING = 1e-9
 #: Range of direction cosines below which there is no focus.
 _PARALLEL = 1e-7
 #: Step of the derivative of the cosines with respect to the pupil point, over the radius of the pupil.
@@ -160,10 +162,7 @@ def lattice_wavelets(
         pending, off = pending[away], off[away]
         points[pending] += np.einsum("nij,nj->ni", jacobian[pending], off)
     else:
-        raise DomainError(
-            f"{field_label(request.fields[0])}: rays could not be aimed at all directions; expected a pupil that the "
-            "telescope maps one to one on its image (huygens_psf does without)"
-        )
+        raise _not_one_to_one(request, "rays could not be aimed at all directions")
     cover = _coverage(lambda finer: lit_rays(rays(finer)[0], finer), points, jacobian, lit, near, n, spacing)
     cell = np.abs(np.linalg.det(by_cosine)) * spacing**2
     annulus = np.pi * radius**2 * (1.0 - telescope.pupil_obscuration**2)
@@ -179,10 +178,22 @@ def lattice_wavelets(
     return WaveletLattice(wavelets, steps, spacing)
 
 
+def _not_one_to_one(request: Request, reason: str) -> DomainError:
+    """Return the error of a field whose rays have not all directions around that of the chief ray."""
+    return DomainError(
+        f"{field_label(request.fields[0])}: {reason}; expected a pupil that the telescope maps one to one on its image "
+        "(huygens_psf does without)"
+    )
+
+
 def range_of_cosines(principal: PrincipalRays) -> float:
-    """Return the largest range of direction cosines across the pupil, 1 over the smallest focal ratio."""
-    largest_range = float((1.0 / principal.f_number).max())
-    if not _PARALLEL < largest_range < np.inf:
+    """Return the largest range of direction cosines across the pupil, 1 over the smallest focal ratio.
+
+    DomainError where the light of a field is parallel.
+    """
+    ranges = (1.0 / principal.f_number).max(axis=1)
+    largest_range = float(ranges.max())
+    if not (ranges.min() > _PARALLEL and largest_range < np.inf):
         raise DomainError(
             f"{principal.telescope}: focal ratio above {1.0 / _PARALLEL:.0e}, the light is parallel; expected a focus"
         )
@@ -235,6 +246,10 @@ class _InverseMap:
                 f"{telescope.name}: {int(usable.sum())} of {len(usable)} rays arrive; expected most of them"
             )
         values, cosine = np.concatenate([entrance, points], axis=1)[usable], cosine[usable]
+        # Behind a cylinder all directions lie in one plane, and no search would find others.
+        largest, smallest = np.linalg.svd(cosine, compute_uv=False)
+        if not smallest > _ROUNDING * largest:
+            raise _not_one_to_one(request, "all rays have directions in one plane")
         self.reach = float(np.abs(cosine).max())
         first, second = (self._powers(cosine[:, axis]) for axis in (0, 1))
         i, j = np.nonzero(np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)) <= _DEGREE)

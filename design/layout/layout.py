@@ -340,7 +340,9 @@ def _draw(axes: Axes, drawing: _Drawing, box: np.ndarray, named: set[str], *, be
     above = drawing.names_above(named)
     labels = _labels(drawing, named, scale, (low, high), above)
     if stop is not None:
-        labels.append(("stop", max((bar[1] for bar in bars), key=lambda point: float(point[int(above)]))))
+        rim = max((bar[1] for bar in bars), key=lambda point: float(point[int(above)]))
+        # A line to a stop far in front would leave no room for the drawing.
+        labels += [("stop", rim)] if (rim >= low).all() and (rim <= high).all() else []
     _write_names(axes, labels, above)
 
 

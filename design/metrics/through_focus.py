@@ -23,6 +23,7 @@ from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import require_image
 from ...raytrace.rays import Projection
 from ...wavefront.bundles import Bundles
+from ...wavefront.chief_rays import reference_rays
 from ...wavefront.pupil_sampling import PupilSampling, SamplingName
 from ...wavefront.request import Request
 from ..drawing import FEW, field_colors, finish_axes, legend_below
@@ -145,7 +146,8 @@ def through_focus(
     Raises
     ------
     DomainError
-        If heights do not ascend, no light of a field reaches the detector, or it arrives parallel.
+        If heights do not ascend, no light of a field reaches the detector, its chief ray does not, or it arrives
+        parallel.
     """
     request = Request.of(
         telescope,
@@ -169,7 +171,9 @@ def through_focus(
     smallest = np.sqrt(np.maximum(np.polynomial.polynomial.polyval(best, square.T, tensor=False), 0.0))
     if defocus is None:
         principal = principal_rays_of(request)
-        blur = max(float(smallest.max()), float((request.wavelengths.mean() * principal.mean_f_number).max()))
+        # Behind a cylinder one of the two focal ratios is infinite, and so is their mean.
+        ratios = np.where(np.isfinite(principal.mean_f_number), principal.mean_f_number, principal.f_number.min(axis=1))
+        blur = max(float(smallest.max()), float((request.wavelengths.mean() * ratios).max()))
         reach = float(np.abs(best - common).max()) + 3.0 * blur / float(np.sqrt(square[:, 2].min()))
         heights = common + reach * np.linspace(-1.0, 1.0, _HEIGHTS)
     else:
@@ -222,6 +226,7 @@ def _wavefronts(request: Request, bundles: list[Bundles], heights: np.ndarray) -
     plane = np.stack([np.ones(len(weights)), *request.unit_pupil.T], axis=-1)
     square, strehl = np.zeros((2, len(bundles[0].chief_path), len(heights)))
     for bundle, fraction in zip(bundles, request.weights, strict=True):
+        reference_rays(request, bundle.wavelength)
         for i, lit in enumerate(bundle.lit):
             if not lit.any():
                 continue

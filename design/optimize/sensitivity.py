@@ -139,7 +139,9 @@ class Sensitivity(FieldResult):
             fields = counted(len(self.fields), "field")
             axes.set_title(f"{plain_text(self.telescope)}, {self.wavelength * 1e9:g} nm: rms over {fields}")
             values, _ = self.modes()
-            modes.semilogy(np.arange(1, len(values) + 1), values, "o-", color=BLUE, markersize=3.5, linewidth=0.9)
+            modes.plot(np.arange(1, len(values) + 1), values, "o-", color=BLUE, markersize=3.5, linewidth=0.9)
+            # Of parameters without effect, such as motions of a plane for the stop, all are zero.
+            modes.set_yscale("log" if (values > 0).any() else "linear")
             modes.xaxis.set_major_locator(MaxNLocator(integer=True))
             modes.grid(True, which="major", linewidth=0.3)
             label = "singular value, each parameter scaled to 1"

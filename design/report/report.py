@@ -114,9 +114,11 @@ def _verdict(where: Where) -> str:
     fields = "at its one field" if len(spots.fields) == 1 else f"over {len(spots.fields)} fields"
     dark = len(spots.fields) - len(radii)
     lost = f"; {dark} of the fields get no light" if dark else ""
-    airy = np.nanmedian(spots.airy_radius) * 1e6
     unit = spots.image_text("µm")
-    return f"Its spots have {sizes} {unit} rms radius {fields}, the Airy disc has {airy:.3g} {unit} radius{lost}."
+    # A cylinder has no round disc.
+    airy = spots.airy_radius[np.isfinite(spots.airy_radius)] * 1e6
+    disc = f", the Airy disc has {np.median(airy):.3g} {unit} radius" if airy.size else ""
+    return f"Its spots have {sizes} {unit} rms radius {fields}{disc}{lost}."
 
 
 def _field_texts(request: Request) -> list[str]:

@@ -22,7 +22,7 @@ from ..media.dispersion import FORMULAS, Dispersion
 from ..media.medium import Medium, RelativeToAir, Sellmeier
 from .bundled import DATA
 from .lens.source import Findings
-from .lens.text import Record, read_text, records
+from .lens.text import Record, read_text, records, scaled
 
 BUNDLED = DATA / "glasses.agf"
 #: Makers whose catalogues come with the package, in the order in which a glass is looked up.
@@ -254,7 +254,8 @@ def _read_glass(head: Record, data: Mapping[str, Record], problems: list[Prescri
     limits = data.get("LD")
     low, high = (limits.number(0), limits.number(1)) if limits else DEFAULT_RANGE
     try:
-        medium = _medium(head, data["CD"], (low / 1e6, high / 1e6))
+        # A wavelength at the end of the range is the same float there, also where the file has it in other units.
+        medium = _medium(head, data["CD"], (scaled(low, -6), scaled(high, -6)))
     except PrescriptionError as error:
         raise (error if error.file else head.problem(f"glass {name}: {error}")) from None
     temperature = USUAL_TEMPERATURE

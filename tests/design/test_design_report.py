@@ -11,6 +11,7 @@ import pytest
 import pachon
 from pachon.design.report import report, sections
 from pachon.design.report.prescription_table import first_order_rows, prescription_rows
+from pachon.models.shapes.freeform import Toroid
 from pachon.models.shapes.shape import EvenAsphere, Plane
 from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM
@@ -147,3 +148,10 @@ def test_the_stop_stands_in_the_table():
     rows = {row[0]: row[1] for row in prescription_rows(lens, 587.6e-9, {})}
     assert rows["S5"] == "baffle, stop"
     assert rows["S4"] == "lens surface"
+
+
+def test_the_verdict_on_a_cylinder_has_no_airy_disc(paraboloid):
+    """It said nan, with a warning of NumPy."""
+    cylinder = paraboloid(2.0, 20.0).with_shape("mirror", Toroid(np.inf, 4.0, -1.0))
+    where = sections.Where(cylinder, np.zeros((1, 2)), np.array([5e-7]), None)
+    assert report._verdict(where) == "Its spots have 2.5e+04 µm rms radius at its one field."

@@ -2,12 +2,11 @@
 
 Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, WTW, REF, AFO, TEM (deg C), PRE (mm of mercury), XAN YAN, XOB
 YOB, XIM YIM, XRI YRI, WTF, VUX VLX VUY VLY, before or after the surfaces SO S SI (curvature or radius, thickness,
-glass), RDY CUY THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE YDE ZDE ADE BDE CDE with DAR, BEN
+glass), RDY CUY THI GLA, STO, SLB, SPH CON ASP with K and A to J (r^4 to r^20), XDE YDE ZDE ADE BDE CDE with DAR, BEN
 and REV, CIR (OBS, HOL, EDG) REX REY and ELX ELY with ADX ADY, linear gratings GRT with GRO, GRS and GRX GRY GRZ (order,
-spacing, vector across the grooves), pick-ups PIK, private glasses PRV PWL END. ADE and BDE
-are left-handed, CDE is right-handed (CODE V reference manual, "Decentered surfaces"), those of a description are right-
-handed. A glass is a name (NBK7_SCHOTT), REFL, or a number (517642). Solves are passed over where their solution is
-given. Rays are aimed at the stop, as CODE V's chief rays are.
+spacing, vector across the grooves), pick-ups PIK, private glasses PRV PWL END. ADE and BDE are left-handed, CDE is
+right-handed (CODE V reference manual, "Decentered surfaces"). A glass is a name (NBK7_SCHOTT), REFL, or a number
+(517642). Solves are passed over where their solution is given. Rays are aimed at the stop, as CODE V's chief rays are.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ VIGNETTING = ("VUX", "VLX", "VUY", "VLY")
 NUMERIC = ("WL", "WTW", "WTF", "TEM", "PRE", "REF", *VIGNETTING, *APERTURES, *POINTS)
 SYSTEM = frozenset(("RDM", "DIM", "TIT", "AFO", "PRV", *NUMERIC))
 LONG_NAMES = {"TITLE": "TIT", "STOP": "STO"}
-POWERS = "ABCDEFG"
+POWERS = "ABCDEFGHJ"
 #: Numbers of surfaces.
 NUMBERS = {*["THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "REX", "REY", "ELX", "ELY", "ADX", "ADY"], *POWERS}
 NUMBERS |= {*GROOVES}
@@ -414,8 +413,11 @@ class _Reader:
         if numbers:
             # Index and Abbe number as they are.
             return numbered_glass(float(numbers[1]), float(numbers[2]), 0.0, name, command)
-        name, *makers = name.strip("'").upper().split("_")
-        return self.private[name] if name in self.private else self.glasses.named(name, command, makers)
+        name = name.strip("'").upper()
+        if name in self.private:
+            return self.private[name]
+        name, *makers = name.split("_")
+        return self.glasses.named(name, command, makers)
 
     def _aperture(self, surface: _Surface) -> Aperture | None:
         unit = self.description.unit

@@ -43,7 +43,9 @@ def telescope_to_codev(telescope: Telescope, *, lenient: bool = False) -> str:
     coatings and formulas of glasses are left out with a warning.
     """
     # CODE V's chief rays pass the middle of the stop.
-    sequence = LensSequence.of(telescope, FILE, tuple(UNITS), aimed="paraxial", lenient=lenient, afocal=True)
+    sequence = LensSequence.of(
+        telescope, FILE, tuple(UNITS), aimed="paraxial", lenient=lenient, afocal=True, straight=True
+    )
     with error_context(subject=telescope.name):
         names = sequence.glass_names("a private glass, a table of indices", "_", stated_maker=True)
         words = {medium: _glass_word(medium, name) for medium, name in names.items()}
@@ -130,7 +132,7 @@ def _surface_lines(sequence: LensSequence, surface: LensSurface, words: Mapping[
         raise PrescriptionError(f"shape: {FILE} is written with conics and even powers from r^4 on")
     powers = profile.even[1:]
     if len(powers) > len(POWERS):
-        raise PrescriptionError(f"{len(powers)} coefficients: {FILE} has {len(POWERS)}, from r^4 to r^16")
+        raise PrescriptionError(f"{len(powers)} coefficients: {FILE} has {len(POWERS)}, from r^4 to r^20")
     last = surface.interaction == Interaction.DETECTOR
     medium = " REFL" if surface.interaction == Interaction.MIRROR else _medium(surface.after, words)
     head = f"{number_text(profile.radius)} {number_text(sequence.thickness(surface))}"

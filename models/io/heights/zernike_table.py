@@ -34,7 +34,8 @@ def zernike_heights(table: Table, file: str | Path) -> SensorHeights:
     Raises
     ------
     PrescriptionError
-        If a column or its unit is missing, a value is not finite, a name occurs twice, or the frame is unknown.
+        If a column or its unit is missing, a value is not finite, a name occurs twice, a radius is not positive, or the
+        frame is unknown.
     """
     for name in COLUMNS:
         if name not in table.colnames:
@@ -61,6 +62,10 @@ def zernike_heights(table: Table, file: str | Path) -> SensorHeights:
     if wrong.size:
         raise PrescriptionError(f"{names[wrong[0]]}: expected MIN_X below MAX_X and MIN_Y below MAX_Y", file=file)
     radius = column["R_OUTER"]
+    wrong = np.flatnonzero(radius <= 0.0)
+    if wrong.size:
+        name = names[wrong[0]]
+        raise PrescriptionError(f"column R_OUTER, {name}: expected a positive radius of the Zernike circle", file=file)
     surfaces = ZernikeSurfaces.from_noll(zernikes[:, 1:], radius, np.zeros_like(center), limits)
     if frame_of(table.meta, "CCS", file) == "CCS":
         surfaces = ZernikeSurfaces(radius, surfaces.origin, -surfaces.coefficients, limits)

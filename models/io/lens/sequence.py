@@ -76,24 +76,32 @@ class LensSequence:
         lenient: bool = False,
         along_light: bool = False,
         afocal: bool = False,
+        straight: bool = False,
     ) -> LensSequence:
         """Return the surfaces and data of a telescope for a kind of `file`, as its name is said in messages.
 
         `units` are the units of length [m] that it may have, `aimed` is the aiming of its program. With `along_light`
         local z axes are along the light in front of an even number of mirrors, against it in front of an odd one.
-        With `afocal` it can say that the image is at infinity.
+        With `afocal` it can say that the image is at infinity; with `straight` distances are those along the axis of
+        the object space, behind folds too.
         PrescriptionError for a telescope that no file of a sequence of surfaces can hold, and unless lenient, which
         makes it a warning, for links and coatings.
         """
-        t, findings = with_true_aperture(require_met(telescope)), Findings(lenient)
-        data = t.design_data
+        by_stop = telescope.design_data.aperture == "stop"
+        t = with_true_aperture(require_met(telescope), straight=straight and not by_stop)
+        data, findings = t.design_data, Findings(lenient)
         with error_context(subject=t.name):
             require_sequential(t, file)
             if data.telecentric:
                 raise PrescriptionError(f"telecentric object space: {file} has no place for it")
             flags = ["afocal"] if data.afocal and not afocal else []
             report_unheld(t, (*data.pickups, *data.solves), file, lenient=lenient, others=flags)
-            own_stop = stop_makes_pupil(t) or (aimed != "off" and stop_states_rays(t))
+            own_stop = stop_makes_pupil(t, straight=straight)
+            if aimed != "off" and not own_stop:
+                # The size of the stop has no place, and is written as the diameter of the entrance pupil.
+                diameter = {"aperture": "entrance_pupil", "aperture_value": t.pupil_diameter}
+                stated = t.with_design(**diameter) if by_stop else t
+                own_stop = stop_states_rays(stated, straight=straight)
             report_pupil_plane(t, findings, own_stop=own_stop, aimed=aimed)
             report_obscuration(t, findings, file)
             if own_stop and data.aiming != aimed:
@@ -171,13 +179,18 @@ class LensSequence:
         assert surface.aperture is not None
         report_aperture(surface.name, surface.aperture, self.file, expected, self.findings)
 
-    def stated_aperture(self, kinds: Collection[str]) -> tuple[str, float]:
-        """Return the aperture, of one of some kinds; if lenient the diameter of the entrance pupil [m] for another."""
+    def stated_aperture(
+        self, kinds: Collection[str], instead: str = "diameter of the entrance pupil"
+    ) -> tuple[str, float]:
+        """Return the aperture, of one of some kinds; if lenient the diameter of the entrance pupil [m] for another.
+
+        `instead` is what it is written as.
+        """
         if self.aperture[0] in kinds:
             return self.aperture
         aperture_name = self.aperture[0].replace("_", " ")
         text = f"aperture = {aperture_name}: {self.file} has no place for it"
-        self.leave_out(text, "written as the diameter of the entrance pupil")
+        self.leave_out(text, f"written as the {instead}")
         return "entrance_pupil", self.telescope.pupil_diameter
 
     def glass_names(self, table: str, forbidden: str = "", *, stated_maker: bool = False) -> Mapping[Medium, str]:
@@ -268,6 +281,7 @@ def lens_surfaces(t: Telescope, stop: str | None, *, along_light: bool = False) 
         against = along_light and sign * float(direction @ axes[:, 2]) < _AGAINST
         aligned, axes = _reversed(surface, axes) if against else (surface, axes)
         position = HALF_TURN @ np.array(surface.vertex) + 0.0
+        screen = surface.interaction == Interaction.DETECTOR and surface is not t.surfaces[-1]
         with error_context(subject=f"surface {surface.name}"):
             if surface.interaction == Interaction.PHASE:
                 raise PrescriptionError("phase screens cannot be written")
@@ -277,7 +291,8 @@ def lens_surfaces(t: Telescope, stop: str | None, *, along_light: bool = False) 
                 position,
                 axes,
                 name=" ".join(surface.name.split()),
-                interaction=surface.interaction,
+                # A detector in front of others has no place in lens files; the light passes it there too.
+                interaction=Interaction.PASS if screen else surface.interaction,
                 before=medium,
                 after=surface.medium_after,
                 aperture=None if aligned.aperture is None else rotated_aperture(aligned.aperture),

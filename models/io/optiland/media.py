@@ -20,6 +20,7 @@ from ..json_items import JsonObject
 from ..lens.description import LensDescription
 from ..lens.glasses import Glasses
 from ..lens.source import Findings
+from ..lens.text import scaled
 
 #: Powers of the wavelength [um] in the series of makers, by the name of the formula.
 SERIES = {
@@ -77,12 +78,12 @@ def _data_medium(material: JsonObject, name: str) -> Medium:
     dispersion = material.child("definition").child("dispersion")
     if dispersion.text("kind") == "tabulated":
         waves, indices = dispersion.numbers("wavelengths_um"), dispersion.numbers("indices")
-        return TabulatedIndex(tuple(w / 1e6 for w in waves), tuple(indices), "linear", name=name)
+        return TabulatedIndex(tuple(scaled(w, -6) for w in waves), tuple(indices), "linear", name=name)
     formula, terms = dispersion.text("formula"), dispersion.numbers("coefficients")
     limits = dispersion.numbers("wavelength_range_um") or WIDEST_RANGE
     if len(limits) != 2:
         dispersion.refuse("wavelength_range_um", "two numbers")
-    low, high = (v / 1e6 for v in limits)
+    low, high = (scaled(v, -6) for v in limits)
     if formula in ("formula 1", "formula 2") and terms and terms[0] == 0 and len(terms) % 2:
         b, c = tuple(terms[1::2]), tuple(v * v if formula == "formula 1" else v for v in terms[2::2])
         return Sellmeier(b, c, (low, high), name=name)
@@ -107,7 +108,7 @@ def material_items(medium: Medium) -> dict[str, Any]:
         terms = [v for a, p in zip(higher_terms, powers[1:], strict=False) for v in (a, float(p))]
         return _data_items(medium, "formula 3", [first, *terms], medium.wavelength_range)
     if isinstance(medium, TabulatedIndex) and medium.interpolation == "linear":
-        table = {"wavelengths_um": [w * 1e6 for w in medium.wavelengths], "indices": list(medium.indices)}
+        table = {"wavelengths_um": [scaled(w, 6) for w in medium.wavelengths], "indices": list(medium.indices)}
         return _material(medium, {"kind": "tabulated", **table})
     raise PrescriptionError("expected a constant index, a formula of Sellmeier or of powers, or a linear table")
 
@@ -116,8 +117,7 @@ _PROPAGATION = {"propagation_model": {"class": "HomogeneousPropagation"}}
 
 
 def _data_items(medium: Medium, formula: str, terms: list[float], limits: tuple[float, float]) -> dict[str, Any]:
-    # A wider range by rounding keeps the wavelengths at its ends.
-    low, high = limits[0] * 1e6, limits[1] * 1e6
+    low, high = (scaled(v, 6) for v in limits)
     dispersion = {"kind": "formula", "formula": formula, "coefficients": terms, "wavelength_range_um": [low, high]}
     return _material(medium, dispersion)
 

@@ -72,7 +72,8 @@ def _system_lines(sequence: LensSequence) -> Iterator[str]:
     # EBR and FNO are at the conjugates of the lens; so is the f-number of an object at infinity.
     kinds = ["object_na", "working_f_number"] if finite else ["entrance_pupil", "f_number", "working_f_number"]
     kinds += ["entrance_pupil"] if sequence.pupil_plane else []
-    kind, value = sequence.stated_aperture(kinds)
+    beam = "numerical aperture of the object" if finite else "diameter of the entrance pupil"
+    kind, value = sequence.stated_aperture(kinds, beam)
     if kind == "entrance_pupil" and finite:
         # The beam of that radius, as the numerical aperture of the object, on the axis to the pupil.
         along = abs(sequence.telescope.object_distance - sequence.telescope.stop_z)

@@ -84,7 +84,8 @@ def _text(t: Telescope, length_unit: str) -> str:
         "groups": [(f"  {flow(name)}: ", _group_items(t, name)) for name in t.groups],
         "obstructions": [("  - ", obstruction_items(obstruction)) for obstruction in t.obstructions],
     }
-    surfaces = [_surface_items(surface, names, coated) for surface in t.surfaces]
+    before = (t.medium_before, *(s.medium_after for s in t.surfaces))
+    surfaces = [_surface_items(*pair, names, coated) for pair in zip(t.surfaces, before, strict=False)]
     angles, waves = _found((head, lists, surfaces), Turn), _found((head, lists, surfaces), Wave)
     angle, turned = _in_unit(angles, "deg", "rad")
     wave, shown = _in_unit(waves, "um", "m")
@@ -123,7 +124,9 @@ def _group_items(t: Telescope, name: str) -> Any:
     return {"surfaces": members, "pivot": in_metres(pivot), "rotation": axes} if framed else members
 
 
-def _surface_items(surface: Surface, names: dict[Medium, str], coated: dict[AnyCoating, str]) -> dict[str, Any]:
+def _surface_items(
+    surface: Surface, before: Medium, names: dict[Medium, str], coated: dict[AnyCoating, str]
+) -> dict[str, Any]:
     x, y, z = surface.vertex
     shape = shape_items(surface.shape)
     kind = INTERACTION_NAMES[surface.interaction]
@@ -135,7 +138,8 @@ def _surface_items(surface: Surface, names: dict[Medium, str], coated: dict[AnyC
     items |= {} if surface.coating is None else {"coating": coated[surface.coating]}
     items |= {} if surface.grating is None else {"grating": _grating_items(surface.grating)}
     items |= {} if surface.thin_lens is None else {"thin_lens": _thin_lens_items(surface.thin_lens)}
-    named = kind == "refract" or (kind == "thin_lens" and surface.medium_after != VACUUM)
+    # Without a name the medium stays what it is in front.
+    named = kind == "refract" or surface.medium_after != before
     return items | ({"medium": Bare(names[surface.medium_after])} if named else {})
 
 

@@ -68,9 +68,9 @@ class _LensReader:
     def lens(self) -> LensDescription:
         """Return the description of the lens."""
         lens, header, first = self.description, self.file.header, self.file.surfaces[0]
+        lens.medium = self._glass(first)[1]
         read_system(lens, header)
         lens.object_distance = object_distance(first, lens.unit)
-        lens.medium = self._glass(first)[1]
         if self.file.solved and lens.design.wavelengths:
             self.axial_ray = self._axial_ray()
         for number, block in enumerate(self.file.surfaces[1:], start=1):

@@ -13,7 +13,7 @@ from ...design_data import AIMING, FIELD_TYPES, DesignData
 from ...media.air import STANDARD_ATMOSPHERE, ZERO_CELSIUS
 from ..lens.description import INFINITE, Format, LensDescription
 from ..lens.source import Source
-from ..lens.text import number_text, scaled
+from ..lens.text import Record, number_text, scaled
 from .file import Block
 
 FORMAT = Format("Zemax", "a line ENPD, FNUM or FLOA", "lines WAVM", "STOP")
@@ -132,7 +132,17 @@ def _read_apertures(lens: LensDescription, header: Block) -> None:
             working = line.number(1, 0.0) == 1
             lens.state_aperture(line, "working_f_number" if working else "f_number", line.number(0, 0.0))
         else:
-            lens.state_aperture(line, "object_na", line.number(0, 0.0))
+            lens.state_aperture(line, "object_na", _object_na(line, lens))
+
+
+def _object_na(line: Record, lens: LensDescription) -> float:
+    """Return the numerical aperture of an object: the number itself, or of ``OBNA angle 1``, half a cone's angle."""
+    value = line.number(0, 0.0)
+    if line.number(1, 0.0) != 1:
+        return value
+    if not 0 < value < 90:
+        raise line.error("an angle between the axis and the cone of the object, above 0 and below 90 degrees")
+    return math.sin(math.radians(value)) * float(lens.medium.index(lens.primary_wavelength))
 
 
 def design_lines(data: DesignData, unit: float) -> list[str]:

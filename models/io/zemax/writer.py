@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,10 @@ from ...design_data import FIELD_TYPES, DesignData
 from ...media.dispersion import Dispersion
 from ...media.medium import ConstantIndex, Medium, Sellmeier
 from ...paraxial import stop_states_rays, with_true_aperture
+from ...rotation import rotation_angles
 from ...surface import Interaction
 from ...telescope import VACUUM, Telescope
+from ...thickness import is_fold
 from ..glass_catalogue import NUMBERED, SELLMEIER_TERMS, GlassCatalogue
 from ..lens.apertures import report_aperture
 from ..lens.description import PUPIL_PLANE, LensSurface
@@ -48,6 +51,8 @@ MM = 1e-3
 UNIT_NAMES = {1e-3: "MM", 1e-2: "CM", 0.0254: "IN", 1.0: "METER"}
 #: Distance from an axis, over the distance from the origin, that is rounding.
 _ROUNDING = 1e-15
+#: Distance from an axis, over that from the origin, and cosines, that are rounding behind fold mirrors.
+_TURNED = 4e-15
 #: AGF coefficients of a glass of constant index: Schott's formula with its first term alone.
 CONSTANT_FORMULA = 1
 
@@ -91,6 +96,7 @@ def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[
             [f"COMM {PUPIL_PLANE}", "STOP", "TYPE STANDARD", "CURV 0.0", *_glass_line(t.medium_before, glasses)]
         )
         surfaces = surfaces[1:]
+    surfaces, turns = _along_folds(t, surfaces)
     numbered: dict[str, tuple[int, list[str]]] = {}
     chains = _chains(t, surfaces)
     for place, (name, surface) in enumerate(zip(t.surface_names, surfaces, strict=True)):
@@ -120,6 +126,9 @@ def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[
             blocks[-1].append(f"DISZ {number_text(_along(surface, first_of_chain) / unit)}")
             if surface is not surfaces[-1]:
                 blocks.append([*_break_lines([-v for v in values], 1), *_glass_line(surface.after, glasses)])
+                if place in turns:
+                    blocks[-1].append("DISZ 0")
+                    blocks.append([*_break_lines([0.0, 0.0, *turns[place]], 0), *_glass_line(surface.after, glasses)])
     if not blocks[-1][-1].startswith("DISZ"):
         blocks[-1].append("DISZ 0")
     left_out = add_link_lines(t, numbered, unit)
@@ -129,6 +138,33 @@ def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[
     for number, block in enumerate(blocks):
         lines += [f"SURF {number}", *(f"  {line}" for line in block)]
     return "\n".join(lines) + "\n", "".join(_catalogue_lines(glasses))
+
+
+def _along_folds(
+    t: Telescope, surfaces: Sequence[LensSurface]
+) -> tuple[tuple[LensSurface, ...], dict[int, list[float]]]:
+    """Return the surfaces in a frame that goes with the light, and the turn [deg] of it behind each fold mirror.
+
+    As in Zemax, whose paraxial trace takes thicknesses alone, the frame turns by twice the tilt of a fold mirror;
+    heights go on along its new axis.
+    """
+    origin, axes, height = np.zeros(3), np.eye(3), np.zeros(3)
+    placed: list[LensSurface] = []
+    turns: dict[int, list[float]] = {}
+    for place, surface in enumerate(surfaces):
+        if turns:
+            position, own_axes = axes.T @ (surface.position - origin), axes.T @ surface.axes
+            position[:2][np.abs(position[:2]) <= _TURNED * float(np.abs(surface.position).max())] = 0.0
+            aligned = np.allclose(own_axes, np.eye(3), rtol=0.0, atol=_TURNED)
+            surface = replace(surface, position=position + height, axes=np.eye(3) if aligned else own_axes)
+        placed.append(surface)
+        if is_fold(t, place):
+            normal = surface.axes[:, 2]
+            turn = (2.0 * np.outer(normal, normal) - np.eye(3)) @ np.diag([-1.0, -1.0, 1.0])
+            ahead = np.array([0.0, 0.0, surface.position[2]])
+            origin, axes, height = origin + axes @ (ahead - height), axes @ turn, ahead
+            turns[place] = np.degrees(rotation_angles(turn)).tolist()
+    return tuple(placed), turns
 
 
 def _along(surface: LensSurface, following: LensSurface) -> float:

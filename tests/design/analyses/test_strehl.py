@@ -5,6 +5,7 @@ import pytest
 
 import pachon
 from pachon.core.errors import DomainError
+from pachon.design.metrics.through_focus import through_focus
 
 
 def test_defocus_in_closed_form(paraboloid):
@@ -66,3 +67,12 @@ def test_parallel_light_is_refused_in_one_line(afocal):
         pachon.design.target_image(telescope)
     # Chief rays have landing points all the same.
     assert np.isnan(pachon.design.lateral_color(telescope, place).airy_radius).all()
+
+
+def test_a_chief_ray_that_does_not_arrive_is_named(paraboloid):
+    """Far from its vertex the paraboloid sends the chief ray along the plane of the detector."""
+    telescope = paraboloid(2.0, 20.0).perturbed("mirror", shift=(0.0, -4.0, 0.0))
+    with pytest.raises(DomainError, match=r"field = \(0, 0\) deg: the chief ray does not reach the image"):
+        pachon.strehl(telescope, [(0.0, 0.0)], 5e-7)
+    with pytest.raises(DomainError, match=r"field = \(0, 0\) deg: the chief ray does not reach the image"):
+        through_focus(telescope, [(0.0, 0.0)], 5e-7, [0.0, 1e-4])

@@ -70,6 +70,45 @@ def test_parallel_light_makes_no_image(paraboloid):
             measure(telescope, [[0.0, 0.0]])
 
 
+HEAD = """name: parallel
+source: none
+version: "1"
+units: {length: m, angle: deg, wavelength: um}
+stop: {z: 0.0}
+pupil: {diameter: 0.05, obscuration: 0.0}
+launch_distance: 2.0
+reference_sphere_radius: 1.0
+field: {radius: 0.2, limit: 0.5}
+wavelengths: {range: [0.4, 0.7], default: 0.5}
+surfaces:
+"""
+#: Two paraboloids with one focus: light of the axis is parallel behind them, that of other fields is not quite.
+EXPANDER = """  - {name: M1, type: mirror, shape: paraboloid, z: 0.0, radius: 2.0}
+  - {name: M2, type: mirror, shape: paraboloid, z: 0.8, radius: 0.4}
+  - {name: Exit, type: detector, shape: plane, z: -0.1}
+"""
+CYLINDER = """  - {name: M1, type: mirror, shape: toroid, z: 0.0, radius_x: flat, radius_y: 2.0, conic_y: -1}
+  - {name: Image, type: detector, shape: plane, z: 1.0}
+"""
+
+
+def test_light_that_is_parallel_at_one_field_makes_no_image(tmp_path):
+    """It ended in a division by zero: the focal ratio of another field is finite."""
+    (tmp_path / "expander.yaml").write_text(HEAD + EXPANDER)
+    telescope = pachon.load_telescope(tmp_path / "expander.yaml")
+    for measure in (fft_psf, mtf):
+        with pytest.raises(DomainError, match=r"focal ratio above 1e\+07"):
+            measure(telescope, [[0.0, 0.0], [0.0, np.deg2rad(0.2)]])
+
+
+def test_light_that_is_parallel_in_one_plane_has_no_lattice(tmp_path):
+    (tmp_path / "cylinder.yaml").write_text(HEAD + CYLINDER)
+    telescope = pachon.load_telescope(tmp_path / "cylinder.yaml")
+    request = Request.of(telescope, [[0.0, 0.0]], sampling=square_annulus(0.025, 0.0, 16), wavelengths=500e-9)
+    with pytest.raises(DomainError, match="all rays have directions in one plane; expected a pupil"):
+        lattice_wavelets(request, 500e-9, np.zeros(2), 1e-4)
+
+
 def test_aimed_rays_of_a_field_with_vignetting_factors():
     lens = pachon.load_telescope(DATA / "circular_aperture_example_with_aperture.zmx")
     factors = (0.1, -0.05, 0.3, 0.2, 0.4)

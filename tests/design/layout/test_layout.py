@@ -188,6 +188,16 @@ def test_the_stop_is_drawn_where_the_light_of_the_axis_ends(request):
     assert layout(pachon.load_telescope("paul_baker")).stop is None
 
 
+def test_a_stop_far_in_front_leaves_the_drawing_its_room(paraboloid):
+    """The line to its name left the axes, which shrank."""
+    surfaces = (Surface("front", Interaction.PASS, Plane(), (0.0, 0.0, 6.0), VACUUM), *paraboloid(2.0, 10.0).surfaces)
+    telescope = replace(paraboloid(2.0, 10.0), surfaces=surfaces).with_design(stop="front")
+    axes = layout(telescope).plot().axes[0]
+    names = [text.get_text() for text in axes.texts]
+    assert "mirror" in names
+    assert "stop" not in names
+
+
 def test_no_ray_is_drawn_outside_the_glass(request):
     """A semi-diameter that is smaller than the light gives way to it; it stops none."""
     lens = pachon.load_telescope(request.config.rootpath / "tests/data/zmx/lens1.zmx")

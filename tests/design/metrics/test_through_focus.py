@@ -6,6 +6,7 @@ from pachon.core.errors import DomainError
 from pachon.core.plotting import png_bytes
 from pachon.design.metrics.spots import spots
 from pachon.design.metrics.through_focus import through_focus
+from pachon.models.shapes.freeform import Toroid
 from pachon.wavefront.opd import wavefront_opd
 from pachon.wavefront.pupil_sampling import pupil_sampling
 
@@ -110,3 +111,15 @@ def test_bad_input_is_refused(lsst_r, paraboloid):
 def test_parallel_light_has_no_focus(afocal, fold):
     with pytest.raises(DomainError, match=r"field = \(0, 0.1\) deg: the light is parallel; expected a focus"):
         through_focus(afocal(fold), np.deg2rad([[0.0, 0.1]]))
+
+
+def test_a_cylinder_has_the_focus_of_its_curved_section(paraboloid):
+    """One focal ratio is infinite; the heights about the focus are finite all the same."""
+    mirror = paraboloid(2.0, 20.0, shift=1e-4)
+    surface = next(s for s in mirror.surfaces if s.shape.curvature)
+    cylinder = mirror.with_shape(surface.name, Toroid(np.inf, surface.shape.radius, -1.0))
+    result = through_focus(cylinder, [[0.0, 0.0]])
+    assert result.best_spot[0] == pytest.approx(-1e-4, abs=1e-12)
+    assert np.isfinite(result.defocus).all()
+    # A line as long as the pupil, of rms D / 4.
+    assert result.smallest_radius[0] == pytest.approx(0.25 * cylinder.pupil_diameter, rel=1e-3)

@@ -8,6 +8,7 @@ from astropy import units as u
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError, UnknownNameError
+from pachon.core.plotting import png_bytes
 from pachon.design.optimize.sensitivity import field_rings, sensitivity
 from pachon.models.parameters.parameters import apply, with_shape_terms
 from pachon.models.shapes.grid import GridSag
@@ -191,6 +192,14 @@ def test_summary_and_picture(result, tmp_path):
     assert summary["parameters"] == list(STEPS)
     assert np.shape(summary["matrix_m_per_unit"]) == (3, 28, len(STEPS))
     assert result.plot().get_axes()
+
+
+def test_parameters_without_effect_have_a_picture(paraboloid):
+    """A logarithmic axis for singular values that are all zero was a warning of matplotlib."""
+    result = sensitivity(paraboloid(baffle=(1.0, 0.06)), ["baffle.dz"], [[0.0, 0.0]], n_zernike=11)
+    assert not result.matrix.any()
+    assert result.plot().axes[1].get_yscale() == "linear"
+    assert png_bytes(result.plot()).startswith(b"\x89PNG")
 
 
 def test_fields_and_quantities(lsst_r):

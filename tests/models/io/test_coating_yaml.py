@@ -93,3 +93,9 @@ def test_formats_without_coatings_refuse_them(lens, tmp_path):
         with pytest.warns(match="coating of S1"):
             pachon.save_telescope(lens, tmp_path / name, lenient=True)
         assert pachon.load_telescope(tmp_path / name).surface_names
+
+
+def test_coatings_without_a_name_load_back_equal(lens, tmp_path):
+    nameless = lens.with_coatings({"S1": pachon.models.Coating((4e-7, 8e-7), (0.9, 0.8))})
+    pachon.save_telescope(nameless, tmp_path / "again.yaml")
+    assert pachon.load_telescope(tmp_path / "again.yaml") == nameless

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import pachon
 from pachon.core.errors import PrescriptionError, PrescriptionWarning
 from pachon.models.aperture import Annulus, Circle, Complement, Ellipse, Rectangle
 from pachon.models.first_order import first_order
@@ -279,6 +280,28 @@ def test_private_glasses(tmp_path):
     assert [float(glass.index(w * 1e-9)) for w in (450, 500, 600, 700)] == pytest.approx(
         [1.54, 1.533, 1.525, 1.52], rel=1e-15
     )
+
+
+def test_private_glasses_may_have_underscores(tmp_path):
+    """What follows an underscore is a maker only where the file has no glass of the whole name."""
+    text = TRIPLET.replace("WL ", "PRV\n PWL 700.0 450.0\n 'E_48' 1.52 1.54\nEND\nWL ")
+    glass = load_telescope(written(tmp_path, text.replace("NSK16_SCHOTT", "'E_48'"))).surface("S1").medium_after
+    assert float(glass.index(700e-9)) == 1.52
+
+
+def test_aspheres_up_to_the_twentieth_power(tmp_path):
+    """Letters go on from G, r^16, to H and J: CODE V has no I."""
+    powers = "ABCDEFGHJ"
+    lines = "".join(f"\n {letter} {(-1) ** i}e-{9 + 2 * i}" for i, letter in enumerate(powers))
+    text = TRIPLET.replace("NSK16_SCHOTT", f"NSK16_SCHOTT\n ASP{lines}", 1).replace("648338", "NF2_SCHOTT")
+    lens = load_telescope(written(tmp_path, text))
+    # In millimetres, along the light.
+    expected = sum((-1) ** i * 10.0 ** -(9 + 2 * i) * 3.0 ** (4 + 2 * i) for i in range(9))
+    sphere = load_telescope(written(tmp_path, TRIPLET)).surface("S1").shape.sag(0.003, 0.0)
+    assert -1e3 * (lens.surface("S1").shape.sag(0.003, 0.0) - sphere) == pytest.approx(expected, rel=1e-9)
+    pachon.save_telescope(lens, tmp_path / "again.seq")
+    again = load_telescope(tmp_path / "again.seq").surface("S1").shape
+    assert again.coefficients == pytest.approx(lens.surface("S1").shape.coefficients, rel=1e-14)
 
 
 def test_an_object_at_infinity_may_be_written_so(tmp_path):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import pachon
 from pachon.core.errors import PrescriptionError, UnknownNameError
 from pachon.models.io.glass_catalogue import FURTHER_MAKERS, MAKERS, OBSOLETE, SUBSTANCES, GlassCatalogue
 from pachon.models.media.air import Air
@@ -194,3 +195,19 @@ def test_a_binary_file_is_refused(tmp_path):
     path.write_bytes(b"\x00\x01\x02NM")
     with pytest.raises(PrescriptionError, match="not a text file"):
         GlassCatalogue.read(path)
+
+
+@pytest.mark.parametrize(("name", "ends"), [("CAF2", (0.23, 9.7)), ("E-LAFH3", (0.4, 0.7))])
+def test_a_lens_may_have_the_wavelengths_at_the_ends_of_a_glass(tmp_path, name, ends):
+    """0.23 / 1e6 is another float than 0.23e-6: the wavelength itself was refused as beyond its glass."""
+    lines = ["MODE SEQ", "UNIT MM", "ENPD 5", "FTYP 0 0 1 2", "XFLN 0", "YFLN 0"]
+    lines += [f"WAVM {i} {wave} 1" for i, wave in enumerate(ends, start=1)]
+    lines += ["SURF 0", "  DISZ INFINITY", "SURF 1", "  STOP", "  CURV 0.02", f"  GLAS {name}", "  DISZ 3"]
+    lines += ["SURF 2", "  DISZ 90", "SURF 3", "  DISZ 0"]
+    lens = written(tmp_path, "\n".join(lines)).rename(tmp_path / "lens.zmx")
+    telescope = pachon.load_telescope(lens)
+    assert telescope.wavelength_range == tuple(float(f"{wave}e-6") for wave in ends)
+    for ending in ("zmx", "yaml", "json"):
+        pachon.save_telescope(telescope, tmp_path / f"again.{ending}")
+        again = pachon.load_telescope(tmp_path / f"again.{ending}")
+        assert again.wavelength_range == telescope.wavelength_range

@@ -260,6 +260,7 @@ UNITS = {"x": "mm", "y": "mm", "z": "um"}
         (zernike_table(ZK=None), ["column ZK is missing"]),
         (zernike_table(ZK=np.zeros(2)), ["ZK has the shape (2,)"]),
         (zernike_table(R_OUTER=[30.0, np.nan]), ["column R_OUTER, A_S01: expected finite numbers"]),
+        (zernike_table(R_OUTER=[30.0, 0.0]), ["column R_OUTER, A_S01: expected a positive radius"]),
         (zernike_table(MIN_X=[30.0, -30.0]), ["A_S00: expected MIN_X below MAX_X"]),
         (zernike_table(("A_S00", "A_S00")), ["A_S00 occurs more than once"]),
         (zernike_table(("B_S00", "B_S01")), ["none of 2 sensors is a CCD of small: expected names such as A_S00"]),

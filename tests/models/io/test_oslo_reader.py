@@ -124,6 +124,19 @@ def test_apertures(tmp_path, system, distance, diameter):
         assert telescope.field_radius == pytest.approx(max(np.arctan(1 / 300), np.deg2rad(0.1)), rel=1e-12)
 
 
+def test_a_beam_of_a_finite_object_is_named_as_it_is_written(tmp_path):
+    """The warning said that the diameter of the entrance pupil, which has no place, was written."""
+    path = lens(tmp_path, "GLA 1.5\nRD 100\nTH 0", "AIR\nRD -100\nTH 100", system="EBR 12\nOBH 1", distance="300")
+    telescope = pachon.load_telescope(path)
+    stated = {"aperture": "entrance_pupil", "aperture_value": telescope.pupil_diameter}
+    message = "aperture = entrance pupil: an OSLO file has no place for it; written as the numerical aperture of the"
+    with pytest.warns(PrescriptionWarning, match=message):
+        pachon.save_telescope(telescope.with_design(**stated), tmp_path / "again.len", lenient=True)
+    read = pachon.load_telescope(tmp_path / "again.len")
+    assert read.design_data.aperture == "object_na"
+    assert read.pupil_diameter == pytest.approx(24e-3, rel=1e-12)
+
+
 @pytest.mark.parametrize(
     ("commands", "shape"),
     [

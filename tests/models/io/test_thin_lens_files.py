@@ -107,3 +107,15 @@ def test_refused_in_one_line(tmp_path):
         with pytest.raises(PrescriptionError, match=message) as caught:
             pachon.load_telescope(path)
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("ending", ["yaml", "zmx", "json"])
+def test_a_thin_lens_out_of_a_medium_into_air(ending, tmp_path):
+    """In water its focus is at 1.33 focal lengths, in air at one: the medium behind it is kept."""
+    window = ["TYPE STANDARD", "CURV 0.0", "STOP", "GLAS WATER 0 0 1.5 40 0 0 0 0 0 0", "DISZ 10"]
+    telescope = pachon.load_telescope(zemax_file(tmp_path, window, paraxial(60.0, 60.0), IMAGE))
+    pachon.save_telescope(telescope, tmp_path / f"again.{ending}")
+    again = pachon.load_telescope(tmp_path / f"again.{ending}")
+    assert first_order(telescope).back_focus == pytest.approx(0.06, rel=1e-14)
+    assert first_order(again).back_focus == pytest.approx(0.06, rel=1e-14)
+    assert [s.medium_after for s in again.surfaces] == [s.medium_after for s in telescope.surfaces]

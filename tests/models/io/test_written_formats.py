@@ -20,6 +20,7 @@ from pachon.models.media.tabulated import TabulatedIndex
 from pachon.models.shapes.freeform import Toroid
 from pachon.models.shapes.polynomial import XYPolynomial, ZernikeSag
 from pachon.models.shapes.sum import Sum
+from pachon.models.surface import Interaction
 
 ROOT = Path(__file__).parents[3]
 LENSES = ROOT / "tests" / "data" / "lenses"
@@ -176,6 +177,40 @@ def test_a_stop_that_does_not_make_the_pupil_stands_on_a_plane_in_front(tmp_path
     read = again(telescope, path, lenient=True)
     assert "the stop and the stated aperture do not make the pupil" in warnings_of(telescope, path)
     assert read.design_data.stop is None
+    assert_same_rays(telescope, read)
+
+
+@pytest.mark.parametrize("aperture", ["FLOA", "FNUM 12 0"])
+@pytest.mark.parametrize("ending", [".yaml", ".zmx", ".seq", ".len", ".json", ".roa"])
+def test_a_stop_behind_a_fold_keeps_its_pupil(tmp_path, ending, aperture):
+    """Distances along the first axis, in Zemax and CODE V files, made another pupil: 29 mm for 40 of a doublet."""
+    text = (LENSES / "fold.zmx").read_text().replace("  STOP\n", "").replace("FNUM 6 0", aperture)
+    stop = "DISZ -20\nSURF 7\n  STOP\n  TYPE STANDARD\n  CURV 0\n  DIAM 2 1\n  DISZ -25.9\nSURF 8\n"
+    (tmp_path / "fold.zmx").write_text(text.replace("DISZ -45.9\nSURF 7\n", stop))
+    telescope = pachon.load_telescope(tmp_path / "fold.zmx").with_design(aiming="off")
+    assert telescope.design_data.stop == "S7"
+    read = again(telescope, tmp_path / f"again{ending}", lenient=True)
+    assert read.pupil_diameter == pytest.approx(telescope.pupil_diameter, rel=1e-12)
+    assert_same_rays(telescope, read)
+    # Where rays are aimed the stop stays.
+    aimed = again(telescope.with_design(aiming="paraxial"), tmp_path / f"aimed{ending}", lenient=True)
+    assert aimed.design_data.stop == "S7"
+
+
+@pytest.mark.parametrize("ending", [".zmx", ".seq", ".len", ".json", ".roa"])
+def test_a_detector_in_front_of_others_is_a_plane_that_the_light_passes(tmp_path, ending):
+    """It ended the glass that it stands in, and a ray-optics file had a gap too few to be read."""
+    telescope = pachon.load_telescope(LENSES / "fold.zmx").with_design(aiming="paraxial")
+    pachon.save_telescope(telescope, tmp_path / "fold.yaml")
+    text = (tmp_path / "fold.yaml").read_text()
+    place = text.index("  - {name: ", text.index("{name: crown"))
+    monitor = "  - {name: monitor, type: detector, shape: plane, z: -0.002}\n"
+    (tmp_path / "fold.yaml").write_text(text[:place] + monitor + text[place:])
+    telescope = pachon.load_telescope(tmp_path / "fold.yaml")
+    assert telescope.surfaces[1].interaction == Interaction.DETECTOR
+    read = again(telescope, tmp_path / f"again{ending}", lenient=True)
+    assert len(read.surfaces) == len(telescope.surfaces)
+    assert [s.interaction for s in read.surfaces].count(Interaction.DETECTOR) == 1
     assert_same_rays(telescope, read)
 
 

@@ -603,6 +603,14 @@ def test_a_telecentric_object_space_has_its_pupil_by_the_numerical_aperture(tmp_
     assert telescope.object_distance - telescope.stop_z == pytest.approx(1.6, rel=1e-14)
     assert telescope.stop_z == telescope.surfaces[0].vertex[2]
     assert telescope.pupil_diameter == pytest.approx(3.2 * math.tan(math.asin(0.02)), rel=1e-14)
+    # The second word makes the number an angle from the axis, as of a cone of 3 deg; in glass its sine counts more.
+    cone = re.sub("ENPD .*", "OBNA 3 1", finite)
+    pupil = 3.2 * math.tan(math.radians(3.0))
+    assert load_telescope(written(tmp_path, cone)).pupil_diameter == pytest.approx(pupil, rel=1e-14)
+    immersed = cone.replace("DISZ 1600", "DISZ 1600\n  GLAS N-BK7")
+    assert load_telescope(written(tmp_path, immersed)).pupil_diameter == pytest.approx(pupil, rel=1e-13)
+    with pytest.raises(PrescriptionError, match="OBNA 90 1: expected an angle between the axis and the cone"):
+        load_telescope(written(tmp_path, cone.replace("OBNA 3 1", "OBNA 90 1")))
     # Of an object at infinity it means nothing.
     assert not load_telescope(written(tmp_path, MIRROR.replace("FTYP 0 0", "FTYP 0 1"))).design_data.telecentric
     with pytest.raises(PrescriptionError, match="telecentric: expected object or image heights as fields"):

@@ -1,6 +1,9 @@
 """Thicknesses, indices and Abbe numbers as parameters: motions by hand, closed forms, exact derivatives."""
 
+import re
 from dataclasses import replace
+from itertools import count
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,6 +41,42 @@ def test_a_thickness_moves_all_that_is_behind(lsst_r, triplet):
     # Groups behind move with their pivots: a tilt afterwards is about the moved one.
     assert further.group_frames["Camera"][0][2] == pytest.approx(lsst_r.group_frames["Camera"][0][2] - 1e-3)
     assert further.group_frames["L1"][0][2] == pytest.approx(further.surface("L1_entrance").vertex[2])
+
+
+@pytest.mark.parametrize(
+    ("model", "fold", "distance", "along"),
+    [("auxtel", "M3", 0.862665389535466, [0, -1, 0]), ("tests/data/lenses/fold.zmx", "fold", 0.0459, [0, 1, 0])],
+)
+def test_a_thickness_behind_a_fold_is_along_the_light(model, fold, distance, along):
+    """It is the whole way to the next vertex, not its part along the normal of the fold mirror."""
+    telescope = pachon.load_telescope(model)
+    assert Parameter.parse(f"{fold}.thickness", telescope).value(telescope) == pytest.approx(distance, rel=1e-12)
+    farther = apply(telescope, {f"{fold}.thickness": 1e-3})
+    for before, after in zip(telescope.surfaces, farther.surfaces, strict=True):
+        behind = telescope.surface_names.index(before.name) > telescope.surface_names.index(fold)
+        assert np.subtract(after.vertex, before.vertex) == pytest.approx(1e-3 * behind * np.array(along), abs=1e-15)
+    (velocity,) = twists(telescope, parse_parameters([f"{fold}.thickness"], telescope), np.zeros(1))[:, -1, :3]
+    assert velocity == pytest.approx(along, abs=1e-15)
+
+
+def test_a_tilted_plate_turns_no_light_to_a_fold(tmp_path):
+    """The 46 mm behind the fold of the lens were 32, along the normal of the mirror."""
+    turn, plane = "SURF\n  TYPE COORDBRK\n  CURV 0\n  PARM 3 {}\n  DISZ {}\n", "SURF\n  TYPE STANDARD\n  CURV 0\n"
+    plate = turn.format(30, 0) + plane + "  GLAS N-BK7 0 0 1.5 40 0 0 0 0 0 0\n  DISZ 2\n" + plane + "  DISZ 0\n"
+    text = Path("tests/data/lenses/fold.zmx").read_text()
+    text = text.replace("DISZ 50\n", f"DISZ 30\n{plate}{turn.format(-30, 18)}")
+    numbers = count()
+    (tmp_path / "plate.zmx").write_text(re.sub(r"SURF( \d+)?", lambda _: f"SURF {next(numbers)}", text))
+    telescope = pachon.load_telescope(tmp_path / "plate.zmx")
+    assert len(telescope.surfaces) == 7
+    assert Parameter.parse("fold.thickness", telescope).value(telescope) == pytest.approx(0.0459, rel=1e-12)
+
+
+def test_a_misaligned_mirror_keeps_its_own_axis(lsst_r):
+    tilted = lsst_r.perturbed("M2", tilt=(1e-3, 0.0, 0.0))
+    expected = lsst_r.surface("M2").vertex[2] - lsst_r.surface("M3").vertex[2]
+    found = Parameter.parse("M2.thickness", tilted).value(tilted)
+    assert found == pytest.approx(expected * np.cos(1e-3), rel=1e-14)
 
 
 def test_an_index_ends_at_a_thin_lens_into_another_medium(triplet):
