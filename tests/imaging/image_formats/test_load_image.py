@@ -302,6 +302,7 @@ def test_galactic_coordinates_and_swapped_axes(field, tmp_path, axes):
     [
         ({"EPOCH": 1950.0}, FK4(equinox="B1950")),
         ({"RADECSYS": "FK4"}, FK4(equinox="B1950")),
+        ({"RADESYS": "icrs"}, ICRS()),
         ({"RADECSYS": "FK5", "EQUINOX": 1975.0}, FK5(equinox="J1975")),
         ({"RADECSYS": "ICRS", "EQUINOX": 2000.0, "EPOCH": 1950.0}, ICRS()),
         ({"EPOCH": "survey"}, ICRS()),
@@ -336,6 +337,9 @@ def changed(**cards):
         (changed(CD1_1=0.0, CD2_1=0.0), {}, r"a\.fits: CD1_1, .*: expected a matrix with an inverse"),
         (changed(CTYPE1="RA---XYZ", CTYPE2="DEC--XYZ"), {}, r"a\.fits: CTYPE1 = RA---XYZ: expected world"),
         (changed(CTYPE1="LINEAR", CTYPE2="LINEAR"), {}, r"a\.fits: no world coordinates \(CTYPE1 = 'LINEAR'"),
+        # astropy takes ecliptic coordinates for those of ICRS, and has no frame for other systems.
+        (changed(CTYPE1="ELON-TAN", CTYPE2="ELAT-TAN"), {}, r"a\.fits: no world coordinates \(CTYPE1 = 'ELON-TAN'"),
+        (changed(RADECSYS="J2000"), {}, r"a\.fits: RADECSYS = J2000: expected ICRS, FK5, FK4 or FK4-NO-E"),
         (
             changed(CTYPE2="RA---TAN"),
             {},
