@@ -90,6 +90,21 @@ def clipped_stars(images: np.ndarray, bad: NDArray[np.bool_]) -> NDArray[np.bool
     return np.isin(greatest, greatest[flat])
 
 
+def clipped_level(image: np.ndarray, good: NDArray[np.bool_]) -> float | None:
+    """Return the greatest value of the good pixels of an image if it is a level of saturation; None otherwise.
+
+    It is one where more pixels side by side have it than symmetry makes equal in a star without noise, and less than
+    half of all.
+    """
+    greatest = image.max(where=good, initial=-np.inf)
+    clipped = good & (image == greatest)
+    count = int(clipped.sum())
+    if count <= _EQUAL_BY_SYMMETRY or 2 * count > int(good.sum()):
+        return None
+    labels, _ = ndimage.label(clipped, np.ones((3, 3)))
+    return float(greatest) if np.bincount(labels.ravel())[1:].max() > _EQUAL_BY_SYMMETRY else None
+
+
 def copied_pixels(images: np.ndarray) -> np.ndarray:
     """Return the pixels of columns and rows that are copies of their neighbours, bool [n, ny, nx].
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
 from ...core.units import ARCSEC, positive_angle, require_positive
+from ...measure.pixel_masks import clipped_level
 from ..image_file import CcdImage
 from .fits_parts import FitsPart, FitsParts
 from .header_cards import BAND_KEYS, CHIP_KEYS, GAIN_KEYS, HeaderCards, Sourced
@@ -197,10 +198,13 @@ def _image_of(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -> C
     image = file.pixels(part).astype(np.float64)
     defects, origins["mask"] = _defects(file, planes, settings)
     saturation = Sourced(settings.saturation, "settings") if settings.saturation is not None else cards.saturation()
+    finite = np.isfinite(image)
+    if saturation is None and not defects.saturated.any():
+        level = clipped_level(image, finite & ~defects.bad)
+        saturation = None if level is None else Sourced(level, "clipped pixels")
     if saturation is not None:
         defects = Defects(defects.saturated | (image >= saturation.value), defects.bad)
         origins["saturation"] = saturation.source
-    finite = np.isfinite(image)
     bad = ~finite | (defects.bad & ~defects.saturated)
     plane = _noise_plane(file, planes, settings)
     if plane is not None:

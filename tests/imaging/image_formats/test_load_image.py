@@ -40,6 +40,14 @@ def test_a_plain_image_has_the_noise_that_it_shows(field, tmp_path):
     assert not image.mask.any()
 
 
+def test_clipped_pixels_are_saturated_without_a_card(field, tmp_path):
+    """Their stars made the PSF of an image wide, and its galaxies 20 % too elliptical."""
+    level = np.float32(0.5 * field.image.max())
+    image = pachon.load_image(write(tmp_path / "a.fits", fits.PrimaryHDU(np.minimum(field.image, level), header_of())))
+    assert np.array_equal(image.mask == SATURATED, field.image >= level)
+    assert image.origins["saturation"] == "clipped pixels"
+
+
 def des_parts(field, compressed):
     kind = fits.CompImageHDU if compressed else fits.ImageHDU
     mask = np.zeros(field.image.shape, dtype=np.int16)
