@@ -173,9 +173,12 @@ def fill_symmetric(images: np.ndarray, bad: np.ndarray, x: Any = 0.0, y: Any = 0
         rows, columns = np.nonzero(bad[i])
         opposite = np.stack([ny - 1 + 2.0 * centers[i, 0] - rows, nx - 1 + 2.0 * centers[i, 1] - columns])
         inside = ((opposite >= 0.0) & (opposite <= np.array([[ny - 1], [nx - 1]]))).all(axis=0)
+        values = near_good[rows, columns]
+        if not inside.any():
+            filled[i, rows, columns] = values
+            continue
         badness = ndimage.map_coordinates(bad[i].astype(np.float64), opposite, order=1, mode="nearest")
         paired = inside & (badness < _OVERLAP)
-        values = near_good[rows, columns]
         if paired.any():
             at = opposite[:, paired]
             on_pixels = np.array_equal(at, np.rint(at))
