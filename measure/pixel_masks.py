@@ -17,6 +17,10 @@ from ..core.units import real_array
 
 # Values at or below this are no light: SExtractor's masked pixels are -1e30.
 _MASKED = -1e29
+# Side of a square of zeros that are no measurements [pixel]: among the zeros of whole numbers there is none.
+_EMPTY_SIDE = 16
+# Side of squares that the other pixels fill for the most part [pixel]: stamps of objects without noise do not.
+_COVERED_SIDE = 64
 # Fewest columns side by side that are copies of each other: two may be alike in a symmetric star without noise.
 _COPIES = 3
 #: Pixels of exactly the greatest value of a star that make it clipped.
@@ -88,6 +92,34 @@ def clipped_stars(images: np.ndarray, bad: NDArray[np.bool_]) -> NDArray[np.bool
         levels, counts = np.unique(greatest[plateaus], return_counts=True)
         flat = plateaus & np.isin(greatest, levels[2 * counts > flat.sum()])
     return np.isin(greatest, greatest[flat])
+
+
+def empty_pixels(image: np.ndarray) -> NDArray[np.bool_]:
+    """Return the pixels of areas of zeros that no exposure reached, bool [ny, nx].
+
+    Resampled images have them in corners and gaps: squares of exact zeros, and the zeros that are connected with them.
+    An image whose zeros are the sky between objects has none.
+    """
+    zero = image == 0.0
+    core = _squares_within(zero, _EMPTY_SIDE)
+    if not core.any():
+        return core
+    labels, count = ndimage.label(zero)
+    holds_core = np.zeros(count + 1, dtype=bool)
+    holds_core[labels[core]] = True
+    empty: NDArray[np.bool_] = holds_core[labels]
+    covered = _squares_within(~empty, _COVERED_SIDE)
+    for axis in (0, 1):
+        covered = ndimage.maximum_filter1d(covered, _COVERED_SIDE, axis=axis, mode="nearest", origin=-1)
+    is_sky = 2 * int(covered.sum()) < int((~empty).sum())
+    return np.zeros_like(empty) if is_sky or empty.all() else empty
+
+
+def _squares_within(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
+    """Return the middles of squares of an even side that lie within a mask, which goes on beyond its edges."""
+    for axis in (0, 1):
+        mask = ndimage.minimum_filter1d(mask, side, axis=axis, mode="nearest")
+    return mask
 
 
 def clipped_level(image: np.ndarray, good: NDArray[np.bool_]) -> float | None:

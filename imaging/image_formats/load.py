@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
 from ...core.units import ARCSEC, positive_angle, require_positive
-from ...measure.pixel_masks import clipped_level
+from ...measure.pixel_masks import clipped_level, empty_pixels
 from ..image_file import CcdImage
 from .fits_parts import FitsPart, FitsParts
 from .header_cards import BAND_KEYS, CHIP_KEYS, GAIN_KEYS, HeaderCards, Sourced
@@ -205,7 +205,7 @@ def _image_of(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -> C
     if saturation is not None:
         defects = Defects(defects.saturated | (image >= saturation.value), defects.bad)
         origins["saturation"] = saturation.source
-    bad = ~finite | (defects.bad & ~defects.saturated)
+    bad = ~finite | empty_pixels(image) | (defects.bad & ~defects.saturated)
     plane = _noise_plane(file, planes, settings)
     if plane is not None:
         bad |= plane.without

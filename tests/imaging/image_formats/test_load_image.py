@@ -40,6 +40,15 @@ def test_a_plain_image_has_the_noise_that_it_shows(field, tmp_path):
     assert not image.mask.any()
 
 
+def test_corners_of_zeros_are_masked(field, tmp_path):
+    """Resampled images have them; without a plane of weights they had "no noise"."""
+    outside = np.add(*np.indices(field.image.shape)) < 0.8 * SIDE
+    path = write(tmp_path / "a.fits", fits.PrimaryHDU(np.where(outside, np.float32(0.0), field.image), header_of()))
+    image = pachon.load_image(path)
+    assert np.array_equal(image.mask == BAD, outside)
+    assert np.median((image.variance / field.variance)[~outside]) == pytest.approx(1.0, abs=0.05)
+
+
 def test_clipped_pixels_are_saturated_without_a_card(field, tmp_path):
     """Their stars made the PSF of an image wide, and its galaxies 20 % too elliptical."""
     level = np.float32(0.5 * field.image.max())
