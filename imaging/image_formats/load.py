@@ -37,6 +37,8 @@ BAD_BIT = 2
 WeightName = Literal["weight", "variance", "rms"]
 #: Cards of the observation that stay as they are.
 _KEPT = ("OBJECT", "TELESCOP", "INSTRUME", "DATE-OBS", "MJD-OBS", "CCDNUM")
+#: Card of images of Pan-STARRS whose pixels are no linear measure of light.
+_SOFTENING = "BSOFTEN"
 #: Bytes of a pixel, its variance and its mask.
 _PLANE_BYTES = 10
 #: Fewest pixels along a side of an image: the stamps of stars have as many.
@@ -178,6 +180,13 @@ def _image_of(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -> C
     if min(part.image_shape) < _LEAST_SIDE:
         ny, nx = part.image_shape
         raise ProductError(f"image of {nx} x {ny} pixels: expected at least {_LEAST_SIDE} along each side", file=path)
+    if _SOFTENING in part.header:
+        raise ProductError(
+            f"{_SOFTENING} = {part.header[_SOFTENING]}: pixels are inverse hyperbolic sines of the light, as of stacks "
+            "of Pan-STARRS: expected linear ones",
+            file=path,
+            key=_SOFTENING,
+        )
     cards = HeaderCards(part.header, path)
     header = fits.Header()
     origins = {"image": f"{path.name} {part.name}".strip()}

@@ -57,20 +57,21 @@ class PlaneNames:
     mask: FitsPart | None = None
 
 
-#: Names of extensions of noise and of masks beside an image.
+#: Names of extensions of noise and of masks beside an image. Of a drizzled image with errors and weights the former
+#: have the noise of photons in them, and its scale.
 _NOISE_NAMES: Mapping[str, WeightKind] = {
     "VARIANCE": WeightKind.VARIANCE,
     "VAR": WeightKind.VARIANCE,
-    "WGT": WeightKind.WEIGHT,
-    "WEIGHT": WeightKind.WEIGHT,
-    "WHT": WeightKind.WEIGHT,
-    "IVAR": WeightKind.WEIGHT,
-    "INVVAR": WeightKind.WEIGHT,
     "ERR": WeightKind.RMS,
     "ERROR": WeightKind.RMS,
     "RMS": WeightKind.RMS,
     "SIGMA": WeightKind.RMS,
     "UNCERT": WeightKind.RMS,
+    "WGT": WeightKind.WEIGHT,
+    "WEIGHT": WeightKind.WEIGHT,
+    "WHT": WeightKind.WEIGHT,
+    "IVAR": WeightKind.WEIGHT,
+    "INVVAR": WeightKind.WEIGHT,
 }
 _MASK_NAMES = ("MASK", "MSK", "DQ", "FLAGS", "DQM", "BPM")
 
@@ -91,7 +92,7 @@ def planes_of(file: FitsParts, extension: str | None) -> list[PlaneNames]:
         If there is no image, or no such one.
     """
     noise, masks = file.named(*_NOISE_NAMES), file.named(*_MASK_NAMES)
-    companions = {part.index for part in (*noise, *masks)}
+    companions = {part.index for part in file.parts if part.name in _NOISE_NAMES or part.name in _MASK_NAMES}
     images = [part for part in file.parts if part.is_image and part.index not in companions]
     if not images:
         raise ProductError("has no image of two axes", file=file.path)

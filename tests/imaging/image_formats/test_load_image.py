@@ -40,6 +40,18 @@ def test_a_plain_image_has_the_noise_that_it_shows(field, tmp_path):
     assert not image.mask.any()
 
 
+@pytest.mark.parametrize("name", ["SCI", ""])
+def test_errors_count_before_weights(field, tmp_path, name):
+    """Drizzled images have both; from relative weights no gain follows."""
+    header = changed(GAIN=None, BUNIT="MJy/sr")
+    image = fits.ImageHDU(field.image, header, name=name)
+    errors = fits.ImageHDU(np.sqrt(field.variance), name="ERR")
+    weights = fits.ImageHDU(np.full(field.image.shape, 800.0), name="WHT")
+    loaded = pachon.load_image(write(tmp_path / "a.fits", fits.PrimaryHDU(), image, weights, errors))
+    np.testing.assert_allclose(loaded.variance, field.variance, rtol=1e-5)
+    assert loaded.gain == pytest.approx(GAIN, rel=0.02)
+
+
 def test_corners_of_zeros_are_masked(field, tmp_path):
     """Resampled images have them; without a plane of weights they had "no noise"."""
     outside = np.add(*np.indices(field.image.shape)) < 0.8 * SIDE
@@ -356,6 +368,7 @@ def changed(**cards):
         (changed(CTYPE1="LINEAR", CTYPE2="LINEAR"), {}, r"a\.fits: no world coordinates \(CTYPE1 = 'LINEAR'"),
         # astropy takes ecliptic coordinates for those of ICRS, and has no frame for other systems.
         (changed(CTYPE1="ELON-TAN", CTYPE2="ELAT-TAN"), {}, r"a\.fits: no world coordinates \(CTYPE1 = 'ELON-TAN'"),
+        (changed(BSOFTEN=3.0), {}, r"a\.fits: BSOFTEN = 3\.0: pixels are inverse hyperbolic sines .* expected linear"),
         (changed(RADECSYS="J2000"), {}, r"a\.fits: RADECSYS = J2000: expected ICRS, FK5, FK4 or FK4-NO-E"),
         (
             changed(CTYPE2="RA---TAN"),
