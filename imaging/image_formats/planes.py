@@ -73,6 +73,12 @@ _NOISE_NAMES: Mapping[str, WeightKind] = {
     "IVAR": WeightKind.WEIGHT,
     "INVVAR": WeightKind.WEIGHT,
 }
+#: What the card UTYPE says of a plane of noise, in files of astropy's CCDData: its class.
+_UNCERTAINTIES: Mapping[str, WeightKind] = {
+    "StdDevUncertainty": WeightKind.RMS,
+    "VarianceUncertainty": WeightKind.VARIANCE,
+    "InverseVariance": WeightKind.WEIGHT,
+}
 _MASK_NAMES = ("MASK", "MSK", "DQ", "FLAGS", "DQM", "BPM")
 
 
@@ -107,7 +113,9 @@ def planes_of(file: FitsParts, extension: str | None) -> list[PlaneNames]:
         images = [part for part in images if part.name in ("IMAGE", "SCI")] or [
             part for part in images if part.image_shape == (noise or images)[0].image_shape
         ]
-    kind = _NOISE_NAMES[noise[0].name] if noise else WeightKind.WEIGHT
+    kind = WeightKind.WEIGHT
+    if noise:
+        kind = _UNCERTAINTIES.get(str(noise[0].header.get("UTYPE", "")).strip(), _NOISE_NAMES[noise[0].name])
     return [PlaneNames(part, beside(part, noise), kind, beside(part, masks)) for part in images]
 
 

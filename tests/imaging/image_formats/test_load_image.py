@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import FK4, FK5, ICRS, SkyCoord
 from astropy.io import fits
+from astropy.nddata import CCDData, InverseVariance, StdDevUncertainty, VarianceUncertainty
 from astropy.wcs import WCS
 from drawn_fields import GAIN, SIDE, header_of, world
 from numpy.polynomial import chebyshev, legendre, polynomial
@@ -38,6 +39,18 @@ def test_a_plain_image_has_the_noise_that_it_shows(field, tmp_path):
     assert image.pixel_scale == pytest.approx(0.263 * ARCSEC, rel=1e-6)
     assert image.origins["gain"] == "GAIN"
     assert not image.mask.any()
+
+
+@pytest.mark.parametrize(
+    ("uncertainty", "power"), [(StdDevUncertainty, 0.5), (VarianceUncertainty, 1.0), (InverseVariance, -1.0)]
+)
+def test_uncertainties_of_astropy_are_of_their_kind(field, tmp_path, uncertainty, power):
+    """All were taken for rms: variances of bright pixels came out 15 times too large."""
+    noise = uncertainty(field.variance.astype(np.float64) ** power)
+    CCDData(field.image, unit="adu", wcs=WCS(world()), uncertainty=noise, meta={"GAIN": GAIN}).write(
+        tmp_path / "a.fits"
+    )
+    np.testing.assert_allclose(pachon.load_image(tmp_path / "a.fits").variance, field.variance, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["SCI", ""])
