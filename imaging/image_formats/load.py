@@ -208,9 +208,11 @@ def _image_of(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -> C
     defects, origins["mask"] = _defects(file, planes, settings)
     saturation = Sourced(settings.saturation, "settings") if settings.saturation is not None else cards.saturation()
     finite = np.isfinite(image)
-    if saturation is None and not defects.saturated.any():
+    if settings.saturation is None and not defects.saturated.any():
         level = clipped_level(image, finite & ~defects.bad)
-        saturation = None if level is None else Sourced(level, "clipped pixels")
+        # A card of raw pixels is too high for those less their bias.
+        if level is not None and (saturation is None or level < saturation.value):
+            saturation = Sourced(level, "clipped pixels")
     if saturation is not None:
         defects = Defects(defects.saturated | (image >= saturation.value), defects.bad)
         origins["saturation"] = saturation.source

@@ -74,10 +74,12 @@ def test_corners_of_zeros_are_masked(field, tmp_path):
     assert np.median((image.variance / field.variance)[~outside]) == pytest.approx(1.0, abs=0.05)
 
 
-def test_clipped_pixels_are_saturated_without_a_card(field, tmp_path):
+@pytest.mark.parametrize("cards", [{}, {"SATURATE": 65535.0}])
+def test_clipped_pixels_are_saturated_whatever_the_card(field, tmp_path, cards):
     """Their stars made the PSF of an image wide, and its galaxies 20 % too elliptical."""
     level = np.float32(0.5 * field.image.max())
-    image = pachon.load_image(write(tmp_path / "a.fits", fits.PrimaryHDU(np.minimum(field.image, level), header_of())))
+    path = write(tmp_path / "a.fits", fits.PrimaryHDU(np.minimum(field.image, level), header_of(**cards)))
+    image = pachon.load_image(path)
     assert np.array_equal(image.mask == SATURATED, field.image >= level)
     assert image.origins["saturation"] == "clipped pixels"
 
