@@ -278,3 +278,12 @@ def test_methods_have_the_units_of_their_class():
     assert pachon.Air.at_humidity(0.5, pressure=750.0 * u.hPa).pressure == pytest.approx(75000.0)
     with pytest.raises(DomainError, match=r"^altitudes = .*: expected a unit that converts to m"):
         site.with_layers(altitudes=[0.0, 5.0] * u.s)
+
+
+def test_pixels_of_tables_are_pure_numbers():
+    """Tables of our own results have places in pixels, and functions that take such places refused them."""
+    assert pure_numbers([1.0, 2.0] * u.pix, "x").tolist() == [1.0, 2.0]
+    assert pachon.measure.match_positions([3.0] * u.pix, [4.0] * u.pix, [3.1], [4.0], 1.0).tolist() == [0]
+    for other in ([1.0] * u.m, [1.0] * u.mag, [1.0] * u.pix**2):
+        with pytest.raises(DomainError, match="expected real numbers without a unit"):
+            pure_numbers(other, "x")
