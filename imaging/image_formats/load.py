@@ -129,8 +129,9 @@ def image_sources(path: Path, extension: str | None = None) -> list[ImageSource]
 def load_image(path: str | Path, *, extension: str | None = None, settings: ImageSettings | None = None) -> CcdImage:
     """Read an image of a CCD from a FITS file of any program.
 
-    Read are images of LSST and HSC (IMAGE, MASK, VARIANCE), of DES (SCI, MSK, WGT), those with extensions of weights,
-    variances, errors and masks of usual names, and plain ones, in one or many extensions, compressed by fpack or gzip.
+    Read are images of LSST and HSC (IMAGE, MASK, VARIANCE), of DES (SCI, MSK, WGT), of Euclid's VIS (3-4.E.SCI and so
+    on), those with extensions of weights, variances, errors and masks of usual names, and plain ones, in one or many
+    extensions, compressed by fpack or gzip.
     World coordinates are those that astropy reads: TAN, SIP, TPV, TNX and others. What is in no card, and cannot be
     measured, is asked for; ``image.origins`` says where each thing came from.
 
