@@ -56,7 +56,7 @@ def check_arguments(target: Target, word_error: type[PachonError] = ConfigError)
     and mappings of them. Arguments annotated as arrays take real numbers: no boolean values, texts, times, complex
     numbers or objects. Masked ones become NaN; quantities keep their unit. Those annotated as boolean arrays take True
     and False, and 1 and 0. A quantity where plain numbers are expected is converted to the unit in square brackets of
-    the docstring.
+    the docstring, of a method or, where that has none, of its class.
 
     Keyword arguments annotated as ``**options: Unpack[SomeTypedDict]`` are checked, and shown in the signature, as if
     each key of the TypedDict were a parameter.
@@ -66,14 +66,14 @@ def check_arguments(target: Target, word_error: type[PachonError] = ConfigError)
     are checked by the function itself.
     """
     if not inspect.isclass(target):
-        return cast(Target, _checked(target, target, word_error))
+        return cast(Target, _checked(target, (target,), word_error))
     for name, member in list(vars(target).items()):
         if name.startswith("_") and name != "__init__":
             continue
         if isinstance(member, (classmethod, staticmethod)):
-            setattr(target, name, type(member)(_checked(member.__func__, member, word_error)))
+            setattr(target, name, type(member)(_checked(member.__func__, (member, target), word_error)))
         elif inspect.isfunction(member):
-            setattr(target, name, _checked(member, target if name == "__init__" else member, word_error))
+            setattr(target, name, _checked(member, (member, target), word_error))
     return target
 
 
@@ -90,7 +90,9 @@ def removed_arguments(**replacements: str) -> Callable[[Target], Target]:
     return decorate
 
 
-def _checked(function: Callable[..., Any], documented: Any, word_error: type[PachonError]) -> Callable[..., Any]:
+def _checked(
+    function: Callable[..., Any], documented: Sequence[Any], word_error: type[PachonError]
+) -> Callable[..., Any]:
     if not set(inspect.get_annotations(function)) - {"return"}:
         return function
 
@@ -125,7 +127,8 @@ def _checked(function: Callable[..., Any], documented: Any, word_error: type[Pac
         except _MismatchError as problem:
             name = problem.name.partition("[")[0]
             # Most calls come without quantities: what they cost is paid here, where plain numbers were expected.
-            if has_unit(problem.value) and (unit := described(documented, name).unit):
+            units = (described(target, name).unit for target in documented)
+            if has_unit(problem.value) and (unit := next(filter(None, units), None)):
                 if name in options:
                     options[name] = _plain_numbers(options[name], unit, name)
                 else:

@@ -76,6 +76,8 @@ def in_unit(value: Any, unit: str, name: str) -> np.ndarray:
         # The unit of a column of pure numbers, such as pixels or magnitudes, says what they count.
         from astropy import units as u
 
+        # Tables of results have places in pixels, which are pure numbers to what takes them.
+        unit = "pix" if not unit and numbers.unit == u.pix else unit
         try:
             numbers = u.Quantity(numbers, copy=None).to_value(unit)
         except u.UnitConversionError:

@@ -124,6 +124,8 @@ class CcdWcs:
         header["CTYPE1"], header["CTYPE2"] = f"RA---{kind}", f"DEC--{kind}"
         header["CUNIT1"] = header["CUNIT2"] = "deg"
         header["RADESYS"] = "ICRS"
+        # The default at a declination of exactly 90 deg is 0: the image would be rotated by half a turn.
+        header["LONPOLE"] = 180.0
         for i, key in enumerate("12"):
             header[f"CRVAL{key}"] = float(np.rad2deg(self.reference[i]))
             header[f"CRPIX{key}"] = float(self.reference_pixel[i] - corner[i] + 1.0)

@@ -53,7 +53,9 @@ def fill_by_moments(
     tuple of array
         Filled stars [n, ny, nx], and those that are lost (:data:`MOST_MASKED`), [n] bool.
     """
-    filled = np.stack([_filled_by_neighbours(image, mask) for image, mask in zip(images, bad, strict=True)])
+    # No pixel stands opposite a centre out there: bad ones hold the mean of good neighbours, sky where there are none.
+    outside = float(max(images.shape))
+    filled = fill_symmetric(images, bad, outside, outside)
     lost = np.zeros(len(images), dtype=bool)
     active = np.arange(len(images))
     previous = np.full((len(images), 3), np.inf)
@@ -63,8 +65,11 @@ def fill_by_moments(
         lost[active[~measured]] = _mostly_bad(bad[active[~measured]])
         active = active[measured]
         moments = MaskedMoments(*(values[measured] for values in moments))
-        for i, star in zip(active, zip(*moments, strict=True), strict=True):
-            filled[i], lost[i] = _filled_by_gaussian(images[i], bad[i], MaskedMoments(*star), sigma)
+        models = np.empty((len(active), *images.shape[1:]))
+        for k, (i, star) in enumerate(zip(active, zip(*moments, strict=True), strict=True)):
+            models[k], lost[i] = _gaussian_of(images[i], bad[i], MaskedMoments(*star), sigma)
+        residuals = fill_symmetric(images[active] - models, bad[active], moments.x, moments.y)
+        filled[active] = np.where(bad[active], models + residuals, images[active])
         state = np.stack([moments.x, moments.y, moments.size], axis=1)
         changed = (np.abs(state - previous[active]) > _CONVERGED).any(axis=1)
         previous[active] = state
@@ -74,23 +79,14 @@ def fill_by_moments(
     return filled, lost
 
 
-def _filled_by_neighbours(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
-    """Return a star whose bad pixels hold the mean of good neighbours, sky where there are none near."""
-    outside = float(max(image.shape))  # no pixel stands opposite a centre out there
-    filled: np.ndarray = fill_symmetric(image[None], bad[None], outside, outside)[0]
-    return filled
-
-
 def _mostly_bad(bad: np.ndarray) -> np.ndarray:
     """Return the stamps [n, ny, nx] without a good pixel in half of those near the centre, [n] bool."""
     rows, columns = (slice(n // 3, n - n // 3) for n in bad.shape[1:])
     return np.asarray(bad[:, rows, columns].mean(axis=(1, 2)) > MOST_MASKED)
 
 
-def _filled_by_gaussian(
-    image: np.ndarray, bad: np.ndarray, star: MaskedMoments, sigma: float
-) -> tuple[np.ndarray, bool]:
-    """Return a star [ny, nx] filled by the Gaussian of its moments, and whether it is lost."""
+def _gaussian_of(image: np.ndarray, bad: np.ndarray, star: MaskedMoments, sigma: float) -> tuple[np.ndarray, bool]:
+    """Return the Gaussian of the moments of a star [ny, nx], and whether the star is lost."""
     ny, nx = image.shape
     x = np.arange(nx) - 0.5 * (nx - 1) - star.x
     y = (np.arange(ny) - 0.5 * (ny - 1) - star.y)[:, None]
@@ -109,7 +105,6 @@ def _filled_by_gaussian(
     norm = (light * gaussian)[good].sum()
     flux = (light * np.where(bad, 0.0, image)).sum() / norm if norm > 0.0 else 0.0
     model = flux * gaussian
-    residual = fill_symmetric((image - model)[None], bad[None], star.x, star.y)[0]
     core = np.where(gaussian > 0.5, gaussian, 0.0)
     lost = any(part[bad].sum() > MOST_MASKED * part.sum() for part in (core, light))
-    return np.where(bad, model + residual, image), lost
+    return model, lost

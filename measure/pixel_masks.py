@@ -17,6 +17,10 @@ from ..core.units import real_array
 
 # Values at or below this are no light: SExtractor's masked pixels are -1e30.
 _MASKED = -1e29
+# Side of a square of zeros that are no measurements [pixel]: among the zeros of whole numbers there is none.
+_EMPTY_SIDE = 16
+# Side of squares that the other pixels fill for the most part [pixel]: stamps of objects without noise do not.
+_COVERED_SIDE = 64
 # Fewest columns side by side that are copies of each other: two may be alike in a symmetric star without noise.
 _COPIES = 3
 #: Pixels of exactly the greatest value of a star that make it clipped.
@@ -90,6 +94,49 @@ def clipped_stars(images: np.ndarray, bad: NDArray[np.bool_]) -> NDArray[np.bool
     return np.isin(greatest, greatest[flat])
 
 
+def empty_pixels(image: np.ndarray) -> NDArray[np.bool_]:
+    """Return the pixels of areas of zeros that no exposure reached, bool [ny, nx].
+
+    Resampled images have them in corners and gaps: squares of exact zeros, and the zeros that are connected with them.
+    An image whose zeros are the sky between objects has none.
+    """
+    zero = image == 0.0
+    core = _squares_within(zero, _EMPTY_SIDE)
+    if not core.any():
+        return core
+    labels, count = ndimage.label(zero)
+    holds_core = np.zeros(count + 1, dtype=bool)
+    holds_core[labels[core]] = True
+    empty: NDArray[np.bool_] = holds_core[labels]
+    covered = _squares_within(~empty, _COVERED_SIDE)
+    for axis in (0, 1):
+        covered = ndimage.maximum_filter1d(covered, _COVERED_SIDE, axis=axis, mode="nearest", origin=-1)
+    is_sky = 2 * int(covered.sum()) < int((~empty).sum())
+    return np.zeros_like(empty) if is_sky or empty.all() else empty
+
+
+def _squares_within(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
+    """Return the middles of squares of an even side that lie within a mask, which goes on beyond its edges."""
+    for axis in (0, 1):
+        mask = ndimage.minimum_filter1d(mask, side, axis=axis, mode="nearest")
+    return mask
+
+
+def clipped_level(image: np.ndarray, good: NDArray[np.bool_]) -> float | None:
+    """Return the greatest value of the good pixels of an image if it is a level of saturation; None otherwise.
+
+    It is one where more pixels side by side have it than symmetry makes equal in a star without noise, and less than
+    half of all.
+    """
+    greatest = image.max(where=good, initial=-np.inf)
+    clipped = good & (image == greatest)
+    count = int(clipped.sum())
+    if count <= _EQUAL_BY_SYMMETRY or 2 * count > int(good.sum()):
+        return None
+    labels, _ = ndimage.label(clipped, np.ones((3, 3)))
+    return float(greatest) if np.bincount(labels.ravel())[1:].max() > _EQUAL_BY_SYMMETRY else None
+
+
 def copied_pixels(images: np.ndarray) -> np.ndarray:
     """Return the pixels of columns and rows that are copies of their neighbours, bool [n, ny, nx].
 
@@ -158,9 +205,12 @@ def fill_symmetric(images: np.ndarray, bad: np.ndarray, x: Any = 0.0, y: Any = 0
         rows, columns = np.nonzero(bad[i])
         opposite = np.stack([ny - 1 + 2.0 * centers[i, 0] - rows, nx - 1 + 2.0 * centers[i, 1] - columns])
         inside = ((opposite >= 0.0) & (opposite <= np.array([[ny - 1], [nx - 1]]))).all(axis=0)
+        values = near_good[rows, columns]
+        if not inside.any():
+            filled[i, rows, columns] = values
+            continue
         badness = ndimage.map_coordinates(bad[i].astype(np.float64), opposite, order=1, mode="nearest")
         paired = inside & (badness < _OVERLAP)
-        values = near_good[rows, columns]
         if paired.any():
             at = opposite[:, paired]
             on_pixels = np.array_equal(at, np.rint(at))

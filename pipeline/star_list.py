@@ -14,7 +14,7 @@ from astropy import units as u
 from ..core.errors import ConfigError, ProductError, error_context
 from ..core.table_files import column_in_unit, read_columns
 from ..models.camera.camera import Camera
-from ..models.star_spectrum import COOLEST, HOTTEST, TEMPERATURE_COLUMNS, ColorBands, color_temperature
+from ..models.star_spectrum import COOLEST, HOTTEST, MISSING, TEMPERATURE_COLUMNS, ColorBands, color_temperature
 from ..models.telescope import Telescope
 from ..raytrace.rays import LOST, field_direction
 from ..sky.pointing import Pointing
@@ -229,6 +229,7 @@ def _read_rows(path: Path, columns: dict[str, str], band: str) -> _Rows:
 
 def _star_temperatures(values: np.ndarray, kind: Literal["teff"] | ColorBands) -> np.ndarray:
     """Return the temperatures [K] of a column of temperatures or colours, NaN where a row has none."""
+    values = np.where(values > MISSING, values, np.nan)
     temperatures = values if kind == "teff" else color_temperature(values, kind)
     temperatures = np.where(np.isfinite(temperatures) & (temperatures > 0.0), temperatures, np.nan)
     return np.clip(temperatures, COOLEST, HOTTEST)

@@ -25,6 +25,7 @@ from .imsim_galaxies import (
     is_instance_catalogue,
 )
 from .pointing import tangent_plane
+from .sky_shapes import along_tangent_plane
 
 #: Kinds of the files that are written, by their endings.
 FORMATS = {".ecsv": "ECSV", ".fits": "FITS", ".fit": "FITS", ".parquet": "Parquet"}
@@ -177,11 +178,12 @@ def _from_catalogue(
     columns: dict[str, Column | np.ndarray], pointing: Any, convention: EllipticityConvention | None = None
 ) -> Galaxies:
     """Return galaxies of one component from the columns of a catalogue."""
+    celestial = None
     if "xi" in columns or "eta" in columns:
         xi, eta = (_column_values(columns, name, u.rad) for name in ("xi", "eta"))
     elif "ra" in columns or "dec" in columns:
-        ra, dec = (_column_values(columns, name, u.deg) for name in ("ra", "dec"))
-        xi, eta = tangent_plane(ra, dec, pointing)
+        celestial = [_column_values(columns, name, u.deg) for name in ("ra", "dec")]
+        xi, eta = tangent_plane(*celestial, pointing)
     else:
         column_names = ", ".join(columns) or "none"
         raise ProductError(f"no columns 'ra' and 'dec', nor 'xi' and 'eta'; columns are {column_names}", key="ra")
@@ -199,6 +201,8 @@ def _from_catalogue(
         e1, e2 = (_column_values(columns, name, default=None if has_ellipticity else 0.0) for name in ("e1", "e2"))
         if e2.any():
             e2 = _sign_of(convention) * e2
+    if celestial is not None:
+        e1, e2 = along_tangent_plane(e1, e2, *celestial, pointing)
     sersic = _column_values(columns, "n", default=1.0)
     return Galaxies.single(xi, eta, magnitude, radius, e1=e1, e2=e2, sersic=sersic)
 

@@ -21,6 +21,7 @@ from ..models.camera.photometry import BANDS, LSST
 from .galaxies import Galaxies
 from .pointing import tangent_plane
 from .sersic import GREATEST_INDEX, LEAST_INDEX
+from .sky_shapes import along_tangent_plane
 
 #: Columns by which a table is known as one of skyCatalogs.
 SIGN_OF_SKY_CATALOGUE = frozenset({"shear_1", "size_disk_true", "size_minor_disk_true"})
@@ -55,10 +56,11 @@ def galaxies_of_sky_catalogue(columns: Mapping[str, Any], path: Path, pointing: 
         If a value is none of a galaxy, or there is no pointing.
     """
     number = {name: _numbers(columns, name) for name in ("ra", "dec", "shear_1", "shear_2", "convergence")}
+    ra, dec = np.deg2rad(number["ra"]), np.deg2rad(number["dec"])
     flux = _fluxes(columns, path, band)
     rows = np.flatnonzero(flux > 0.0)
     bulge = _bulge_fraction(columns, len(flux))
-    xi, eta = tangent_plane(np.deg2rad(number["ra"][rows]), np.deg2rad(number["dec"][rows]), pointing)
+    xi, eta = tangent_plane(ra[rows], dec[rows], pointing)
     shear = number["shear_1"] + 1j * number["shear_2"], number["convergence"]
     parts: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     for name in _COMPONENTS:
@@ -85,7 +87,8 @@ def galaxies_of_sky_catalogue(columns: Mapping[str, Any], path: Path, pointing: 
         first.append(len(per_galaxy))
         radii.append(whole)
     table = np.array(per_galaxy).reshape(-1, 5)
-    zero = np.zeros(len(table))
+    zero, owner = np.zeros(len(table)), np.repeat(rows, np.diff(first))
+    e1, e2 = along_tangent_plane(table[:, 2], table[:, 3], ra[owner], dec[owner], pointing)
     # Photons a second and square centimetre through the whole system (SMTN-002).
     magnitude = BANDS[band].zero_point - 2.5 * np.log10(_AREA_CM2 * flux[rows])
     return Galaxies(
@@ -98,8 +101,8 @@ def galaxies_of_sky_catalogue(columns: Mapping[str, Any], path: Path, pointing: 
         dy=zero,
         fraction=table[:, 0],
         component_radius=table[:, 1],
-        e1=table[:, 2],
-        e2=table[:, 3],
+        e1=e1,
+        e2=e2,
         sersic=table[:, 4],
     )
 
@@ -138,9 +141,11 @@ def galaxies_of_instance_catalogue(path: Path, pointing: Any) -> Galaxies:
     ellipticity = (1.0 - ratio) / (1.0 + ratio) * np.exp(2j * (0.5 * np.pi - np.deg2rad(angle)))
     # phosim's shear has the other sign of gamma2.
     radius, e = _lensed(np.sqrt(a * b) * ARCSEC, ellipticity, gamma1 - 1j * gamma2, kappa)
-    xi, eta = tangent_plane(np.deg2rad(ra), np.deg2rad(dec), pointing)
+    ra, dec = np.deg2rad(ra), np.deg2rad(dec)
+    xi, eta = tangent_plane(ra, dec, pointing)
+    e1, e2 = along_tangent_plane(e.real, -e.imag, ra, dec, pointing)
     sersic = np.where(knots > 0.0, 1.0, np.clip(index, LEAST_INDEX, GREATEST_INDEX))
-    return Galaxies.single(xi, eta, magnitude, radius, e1=e.real, e2=-e.imag, sersic=sersic)
+    return Galaxies.single(xi, eta, magnitude, radius, e1=e1, e2=e2, sersic=sersic)
 
 
 def _lensed(

@@ -71,9 +71,9 @@ class Pointing:
     @property
     def axes(self) -> np.ndarray:
         """Unit vectors along the telescope's +x, +y and +z (towards the sky) in equatorial coordinates, as rows."""
-        (sa, sd, sr), (ca, cd, cr) = (f([self.ra, self.dec, self.position_angle]) for f in (np.sin, np.cos))
-        east, north = np.array([-sa, ca, 0.0]), np.array([-sd * ca, -sd * sa, cd])
-        return np.stack([cr * east - sr * north, sr * east + cr * north, np.array([cd * ca, cd * sa, sd])])
+        east, north, outwards = _sky_axes(self.ra, self.dec)
+        sine, cosine = np.sin(self.position_angle), np.cos(self.position_angle)
+        return np.stack([cosine * east - sine * north, sine * east + cosine * north, outwards])
 
     @check_arguments
     def to_sky(self, slopes: ArrayLike) -> np.ndarray:
@@ -113,6 +113,22 @@ class Pointing:
         east = np.cos(delta) * np.sin(turn)
         north = cosine * np.sin(delta) - sine * np.cos(delta) * np.cos(turn)
         return np.stack([east / depth, north / depth], axis=-1)
+
+    def jacobians(self, ra: np.ndarray, dec: np.ndarray) -> np.ndarray:
+        """Return d(xi, eta)/d(east, north) at right ascensions and declinations [n] in rad, shape [n, 2, 2].
+
+        Away from the equator north is not along eta: meridians meet at the poles.
+        """
+        vectors = _sky_axes(ra, dec) @ _sky_axes(self.ra, self.dec).T
+        plane, ahead = vectors[:, 2, :2, None] / vectors[:, 2, 2, None, None], vectors[:, 2, 2, None, None]
+        return np.asarray((vectors[:, :2, :2].transpose(0, 2, 1) - plane * vectors[:, None, :2, 2]) / ahead)
+
+
+def _sky_axes(ra: ArrayLike, dec: ArrayLike) -> np.ndarray:
+    """Return unit vectors towards east, north and outwards in equatorial coordinates, as rows, shape [..., 3, 3]."""
+    (sa, ca), (sd, cd) = ((np.sin(angles), np.cos(angles)) for angles in (ra, dec))
+    rows = (-sa, ca, 0.0 * sa), (-sd * ca, -sd * sa, cd), (cd * ca, cd * sa, sd)
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _angle_pairs(values: ArrayLike, name: str) -> np.ndarray:

@@ -23,6 +23,7 @@ from ..core.errors import DomainError, shown
 from ..core.point_plots import draw_shapes
 from ..core.result import Result
 from ..core.units import pure_numbers
+from .pointing import Pointing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -115,6 +116,16 @@ def along_sky(g1: np.ndarray, g2: np.ndarray, jacobians: np.ndarray) -> tuple[np
     turned = np.where(determinant > 0.0, shape, shape.conj()) * direction**2 / np.abs(direction) ** 2
     on_sky = np.where(finite, (turned + pixel_shear) / (1.0 + pixel_shear.conj() * turned), np.nan * (1.0 + 1.0j))
     return on_sky.real, on_sky.imag
+
+
+def along_tangent_plane(
+    e1: np.ndarray, e2: np.ndarray, ra: np.ndarray, dec: np.ndarray, pointing: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return shapes along xi and eta about a pointing, from those along east and north at ra, dec [rad], all [n].
+
+    Both have e2 > 0 along the diagonal between their axes.
+    """
+    return along_sky(e1, e2, Pointing.of(pointing).jacobians(ra, dec))
 
 
 def jacobians_on_sky(

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
 from ...core.units import ARCSEC, positive_angle, require_positive
+from ...measure.pixel_masks import clipped_level, empty_pixels
 from ..image_file import CcdImage
 from .fits_parts import FitsPart, FitsParts
 from .header_cards import BAND_KEYS, CHIP_KEYS, GAIN_KEYS, HeaderCards, Sourced
@@ -36,6 +37,8 @@ BAD_BIT = 2
 WeightName = Literal["weight", "variance", "rms"]
 #: Cards of the observation that stay as they are.
 _KEPT = ("OBJECT", "TELESCOP", "INSTRUME", "DATE-OBS", "MJD-OBS", "CCDNUM")
+#: Card of images of Pan-STARRS whose pixels are no linear measure of light.
+_SOFTENING = "BSOFTEN"
 #: Bytes of a pixel, its variance and its mask.
 _PLANE_BYTES = 10
 #: Fewest pixels along a side of an image: the stamps of stars have as many.
@@ -126,8 +129,9 @@ def image_sources(path: Path, extension: str | None = None) -> list[ImageSource]
 def load_image(path: str | Path, *, extension: str | None = None, settings: ImageSettings | None = None) -> CcdImage:
     """Read an image of a CCD from a FITS file of any program.
 
-    Read are images of LSST and HSC (IMAGE, MASK, VARIANCE), of DES (SCI, MSK, WGT), those with extensions of weights,
-    variances, errors and masks of usual names, and plain ones, in one or many extensions, compressed by fpack or gzip.
+    Read are images of LSST and HSC (IMAGE, MASK, VARIANCE), of DES (SCI, MSK, WGT), of Euclid's VIS (3-4.E.SCI and so
+    on), those with extensions of weights, variances, errors and masks of usual names, and plain ones, in one or many
+    extensions, compressed by fpack or gzip.
     World coordinates are those that astropy reads: TAN, SIP, TPV, TNX and others. What is in no card, and cannot be
     measured, is asked for; ``image.origins`` says where each thing came from.
 
@@ -177,6 +181,13 @@ def _image_of(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -> C
     if min(part.image_shape) < _LEAST_SIDE:
         ny, nx = part.image_shape
         raise ProductError(f"image of {nx} x {ny} pixels: expected at least {_LEAST_SIDE} along each side", file=path)
+    if _SOFTENING in part.header:
+        raise ProductError(
+            f"{_SOFTENING} = {part.header[_SOFTENING]}: pixels are inverse hyperbolic sines of the light, as of stacks "
+            "of Pan-STARRS: expected linear ones",
+            file=path,
+            key=_SOFTENING,
+        )
     cards = HeaderCards(part.header, path)
     header = fits.Header()
     origins = {"image": f"{path.name} {part.name}".strip()}
@@ -197,11 +208,16 @@ def _image_of(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -> C
     image = file.pixels(part).astype(np.float64)
     defects, origins["mask"] = _defects(file, planes, settings)
     saturation = Sourced(settings.saturation, "settings") if settings.saturation is not None else cards.saturation()
+    finite = np.isfinite(image)
+    if settings.saturation is None and not defects.saturated.any():
+        level = clipped_level(image, finite & ~defects.bad)
+        # A card of raw pixels is too high for those less their bias.
+        if level is not None and (saturation is None or level < saturation.value):
+            saturation = Sourced(level, "clipped pixels")
     if saturation is not None:
         defects = Defects(defects.saturated | (image >= saturation.value), defects.bad)
         origins["saturation"] = saturation.source
-    finite = np.isfinite(image)
-    bad = ~finite | (defects.bad & ~defects.saturated)
+    bad = ~finite | empty_pixels(image) | (defects.bad & ~defects.saturated)
     plane = _noise_plane(file, planes, settings)
     if plane is not None:
         bad |= plane.without

@@ -32,6 +32,9 @@ _FEWEST_BRIGHT = 200
 _WITH_PHOTONS = 0.5
 #: Scatter of the slope, over the slope, below which the variance follows the light.
 _STEADY = 0.5
+#: Variances so many times that of half of the pixels stand for no weight, as 1e30 of SExtractor does: no light of a
+#: pixel has so much noise.
+_MOST_NOISE = 1e8
 #: Blur of faint light of which the photon noise is taken, rms [pixel]: that of single pixels would follow their noise,
 #: and bright ones count too little.
 _BLUR = 1.0
@@ -88,7 +91,7 @@ class PixelVariance:
 
 
 def variance_of_plane(plane: np.ndarray, kind: WeightKind, name: str) -> PixelVariance:
-    """Return the variance of a plane of weights, variances or rms; pixels of weight zero have none."""
+    """Return the variance of a plane of weights, variances or rms; pixels of next to no weight have none."""
     values = plane.astype(np.float64)
     good = np.isfinite(values) & (values > 0.0)
     values = np.where(good, values, 1.0)
@@ -96,6 +99,9 @@ def variance_of_plane(plane: np.ndarray, kind: WeightKind, name: str) -> PixelVa
         values = 1.0 / values
     elif kind is WeightKind.RMS:
         values = values**2
+    if good.any():
+        good &= values <= _MOST_NOISE * float(np.median(values[good]))
+        values = np.where(good, values, 1.0)
     return PixelVariance(values, f"{name} ({kind.value})", ~good)
 
 

@@ -1,7 +1,8 @@
 """Image, variance and mask of a file, by the convention of the pipeline that wrote it.
 
 A reader of a convention says which parts of a file are images, and which lie beside each: LSST and HSC (IMAGE, MASK,
-VARIANCE), DES (SCI, MSK, WGT), and any other file, whose companions have usual names or are files of their own.
+VARIANCE), DES (SCI, MSK, WGT), Euclid's VIS (3-4.E.SCI, 3-4.E.RMS, 3-4.E.FLG), and any other file, whose companions
+have usual names or are files of their own.
 """
 
 from __future__ import annotations
@@ -23,6 +24,14 @@ from .fits_parts import FitsPart, FitsParts, beside
 _DES_SATURATED = 2
 #: Bit of the haloes of bright stars there, which marks an area.
 _DES_STAR = 32
+
+#: Ends of the names of Euclid's extensions: the pixels, their rms, their flags.
+_EUCLID_IMAGE, _EUCLID_RMS, _EUCLID_FLAGS = ".SCI", ".RMS", ".FLG"
+#: Bits of Euclid's flags of saturated pixels: SAT, SATURATEDSTAR, ADCMAX (its data product description, VIS flag map).
+_EUCLID_SATURATED = 1 << 3 | 1 << 19 | 1 << 21
+#: Bits of bad pixels there: INVALID, HOT, COLD, COSMIC, GHOST, BAD_COLUMN, BAD_CLUSTER, OVRCOL, CHARINJ, SATXTALKGHOST,
+#: NO_DATA. Others mark an area or an object.
+_EUCLID_BAD = sum(1 << bit for bit in (0, 1, 2, 4, 5, 7, 8, 12, 15, 17, 22))
 
 
 class WeightKind(Enum):
@@ -50,20 +59,27 @@ class PlaneNames:
     mask: FitsPart | None = None
 
 
-#: Names of extensions of noise and of masks beside an image.
+#: Names of extensions of noise and of masks beside an image. Of a drizzled image with errors and weights the former
+#: have the noise of photons in them, and its scale.
 _NOISE_NAMES: Mapping[str, WeightKind] = {
     "VARIANCE": WeightKind.VARIANCE,
     "VAR": WeightKind.VARIANCE,
-    "WGT": WeightKind.WEIGHT,
-    "WEIGHT": WeightKind.WEIGHT,
-    "WHT": WeightKind.WEIGHT,
-    "IVAR": WeightKind.WEIGHT,
-    "INVVAR": WeightKind.WEIGHT,
     "ERR": WeightKind.RMS,
     "ERROR": WeightKind.RMS,
     "RMS": WeightKind.RMS,
     "SIGMA": WeightKind.RMS,
     "UNCERT": WeightKind.RMS,
+    "WGT": WeightKind.WEIGHT,
+    "WEIGHT": WeightKind.WEIGHT,
+    "WHT": WeightKind.WEIGHT,
+    "IVAR": WeightKind.WEIGHT,
+    "INVVAR": WeightKind.WEIGHT,
+}
+#: What the card UTYPE says of a plane of noise, in files of astropy's CCDData: its class.
+_UNCERTAINTIES: Mapping[str, WeightKind] = {
+    "StdDevUncertainty": WeightKind.RMS,
+    "VarianceUncertainty": WeightKind.VARIANCE,
+    "InverseVariance": WeightKind.WEIGHT,
 }
 _MASK_NAMES = ("MASK", "MSK", "DQ", "FLAGS", "DQM", "BPM")
 
@@ -84,7 +100,9 @@ def planes_of(file: FitsParts, extension: str | None) -> list[PlaneNames]:
         If there is no image, or no such one.
     """
     noise, masks = file.named(*_NOISE_NAMES), file.named(*_MASK_NAMES)
-    companions = {part.index for part in (*noise, *masks)}
+    of_euclid = _euclid_planes(file)
+    companions = {part.index for part in file.parts if part.name in _NOISE_NAMES or part.name in _MASK_NAMES}
+    companions |= {part.index for planes in of_euclid.values() for part in (planes.noise, planes.mask) if part}
     images = [part for part in file.parts if part.is_image and part.index not in companions]
     if not images:
         raise ProductError("has no image of two axes", file=file.path)
@@ -94,13 +112,36 @@ def planes_of(file: FitsParts, extension: str | None) -> list[PlaneNames]:
         images = [part for part in images if extension.upper() in (file.label(part), str(part.index))] or named
         if not images:
             raise ProductError(f"extension = {extension}: expected one of {names}", file=file.path, key="extension")
+    if of_euclid:
+        return [of_euclid[part.index] for part in images if part.index in of_euclid]
     if companions and len(images) > 1:
         # IMAGE or SCI is what the planes belong to; catalogues of LSST have small images of PSFs and transmissions.
         images = [part for part in images if part.name in ("IMAGE", "SCI")] or [
             part for part in images if part.image_shape == (noise or images)[0].image_shape
         ]
-    kind = _NOISE_NAMES[noise[0].name] if noise else WeightKind.WEIGHT
+    kind = WeightKind.WEIGHT
+    if noise:
+        kind = _UNCERTAINTIES.get(str(noise[0].header.get("UTYPE", "")).strip(), _NOISE_NAMES[noise[0].name])
     return [PlaneNames(part, beside(part, noise), kind, beside(part, masks)) for part in images]
+
+
+def _euclid_planes(file: FitsParts) -> dict[int, PlaneNames]:
+    """Return the images of Euclid's VIS with their planes, by their numbers; none of another file."""
+    by_name = {part.name: part for part in file.parts if part.is_image}
+    stems = {
+        part.index: part.name.removesuffix(_EUCLID_IMAGE)
+        for part in by_name.values()
+        if part.name.endswith(_EUCLID_IMAGE)
+    }
+    return {
+        index: PlaneNames(
+            file.parts[index],
+            by_name.get(f"{stem}{_EUCLID_RMS}"),
+            WeightKind.RMS,
+            by_name.get(f"{stem}{_EUCLID_FLAGS}"),
+        )
+        for index, stem in stems.items()
+    }
 
 
 def companion_in(path: Path, image: FitsPart) -> tuple[FitsParts, FitsPart]:
@@ -126,8 +167,9 @@ def companion_in(path: Path, image: FitsPart) -> tuple[FitsParts, FitsPart]:
 def defects_of(values: np.ndarray, part: FitsPart, path: Path) -> Defects:
     """Return the saturated and the bad pixels that a mask marks.
 
-    Cards MP_NAME number the planes of LSST's and of this program's masks; extensions MSK have the bits of DES. In any
-    other mask pixels that are not zero are bad: codes of other pipelines change with their versions.
+    Cards MP_NAME number the planes of LSST's and of this program's masks; extensions MSK have the bits of DES, those of
+    Euclid its own. In any other mask pixels that are not zero are bad: codes of other pipelines change with their
+    versions.
 
     Raises
     ------
@@ -143,6 +185,9 @@ def defects_of(values: np.ndarray, part: FitsPart, path: Path) -> Defects:
         bits = values.astype(np.int64)
         saturated = (bits & bits_of(planes, TOO_BRIGHT)) != 0
         return Defects(saturated, (bits & bits_of(planes, planes.keys() - HARMLESS - TOO_BRIGHT)) != 0)
+    if part.name.endswith(_EUCLID_FLAGS):
+        bits = values.astype(np.int64)
+        return Defects((bits & _EUCLID_SATURATED) != 0, (bits & _EUCLID_BAD) != 0)
     if part.name == "MSK":
         bits = values.astype(np.int64)
         return Defects((bits & _DES_SATURATED) != 0, (bits & ~np.int64(_DES_SATURATED | _DES_STAR)) != 0)

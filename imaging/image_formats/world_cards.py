@@ -19,6 +19,8 @@ _CARDS = re.compile(
 )
 #: Cards whose numbers must be finite.
 _NUMBERS = re.compile(r"(CRVAL|CRPIX|CDELT|CROTA|CD|PC|PV|A_|B_|AP_|BP_|EQUINOX|LONPOLE|LATPOLE)")
+#: Systems of right ascension and declination; astropy has no frame for others, such as GAPPT.
+_SYSTEMS = ("ICRS", "FK5", "FK4", "FK4-NO-E")
 #: Largest determinant over the product of the sides of a pixel that still counts as none.
 _FLAT = 1e-8
 
@@ -29,17 +31,24 @@ def world_cards(header: fits.Header, shape: tuple[int, int], path: Path) -> fits
     Raises
     ------
     ProductError
-        If a number is none, or the coordinates are singular, not finite on the image, or of an unknown projection.
+        If a number is none, or the coordinates are singular, not finite on the image, or of an unknown projection or
+        system.
     """
     cards = fits.Header()
     kinds = [str(header.get(f"CTYPE{axis}", "")).strip().upper() for axis in (1, 2)]
-    if not any(kind.startswith(("RA", "GLON", "ELON")) for kind in kinds):
+    if not any(kind.startswith(("RA", "GLON")) for kind in kinds):
         return None
     for card in header.cards:
         if card.keyword == "EPOCH" and not _is_equinox(header, path):
             continue
         if card.keyword and _CARDS.fullmatch(card.keyword) and card.keyword not in cards:
             cards[card.keyword] = _value(header, card.keyword, path)
+    for key in ("RADESYS", "RADECSYS"):
+        if system := str(cards.get(key, "")).strip().upper():
+            if system not in _SYSTEMS:
+                expected = f"{', '.join(_SYSTEMS[:-1])} or {_SYSTEMS[-1]}"
+                raise ProductError(f"{key} = {cards[key]}: expected {expected}", file=path, key=key)
+            cards[key] = system
     # wcslib takes the numbers of a projection as degrees where a header of an early IRAF has no unit.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

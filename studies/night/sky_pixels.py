@@ -66,15 +66,16 @@ def covered_pixels(experiment: Experiment, nside: int) -> SkyPixels:
 def interpolated(camera: Camera, ccd: int, places: PlaceShapes, jacobians: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """Return sigma, g1 and g2 on the sky and area at points of a CCD [m], shape [n, 4].
 
-    `jacobians` are d(west, north)/d(x, y) at the places, [m, 2, 2]: g1 > 0 from east to west, g2 > 0 from north-west to
+    `jacobians` are d(west, north)/d(x, y) at the points, [n, 2, 2]: g1 > 0 from east to west, g2 > 0 from north-west to
     south-east. Values are those of a polynomial over the CCD, of the second order where there are at least twelve
-    places, of the first where there are six, else of the mean.
+    places, of the first where there are six, else of the mean: of g along x and y, since near a pole the sky turns.
     """
-    values = np.stack([places.sigma, *along_sky(places.g1, places.g2, jacobians), places.area], axis=1)
+    values = np.stack([places.sigma, places.g1, places.g2, places.area], axis=1)
     good = np.isfinite(values).all(axis=1)
     order = 2 if good.sum() >= 12 else 1 if good.sum() >= 6 else 0
     design, points = (_monomials(camera.to_uv(ccd, at), order) for at in (places.xy[good], xy))
-    return np.asarray(points @ np.linalg.lstsq(design, values[good], rcond=None)[0])
+    sigma, g1, g2, area = (points @ np.linalg.lstsq(design, values[good], rcond=None)[0]).T
+    return np.stack([sigma, *along_sky(g1, g2, jacobians), area], axis=1)
 
 
 def _monomials(uv: np.ndarray, order: int) -> np.ndarray:

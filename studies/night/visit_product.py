@@ -257,9 +257,9 @@ def _pixels(experiment: Experiment, places: dict[int, rows.PlaceShapes], nside: 
     mask = np.isin(covered.ccd, list(places))
     index, ccd, xy = (values[mask] for values in covered)
     values = np.zeros((len(index), 4))
-    jacobians = sky_jacobians(experiment, [shapes.xy for shapes in places.values()])
-    for (number, shapes), sky_axes in zip(places.items(), jacobians, strict=True):
-        on_ccd = ccd == number
-        if on_ccd.any():
+    of_ccds = [np.flatnonzero(ccd == number) for number in places]
+    jacobians = sky_jacobians(experiment, [xy[on_ccd] for on_ccd in of_ccds])
+    for (number, shapes), on_ccd, sky_axes in zip(places.items(), of_ccds, jacobians, strict=True):
+        if len(on_ccd):
             values[on_ccd] = interpolated(experiment.camera, number, shapes, sky_axes, xy[on_ccd])
     return dict(zip(PIXEL_COLUMNS, (index, ccd.astype(np.int64), *values.T), strict=True))

@@ -266,3 +266,24 @@ def test_checks_hold_nothing_of_their_callers():
         assert caller()() is None
     finally:
         gc.enable()
+
+
+def test_methods_have_the_units_of_their_class():
+    """Their docstrings say that arguments are as in the class: quantities were refused as no numbers."""
+    layers = {"altitudes": [0.0, 5.0] * u.km, "weights": [0.4, 0.6], "wind_speeds": [18.0, 36.0] * u.km / u.hour}
+    site = pachon.models.load_site("cerro_pachon").with_layers(**layers)
+    assert site.altitudes == pytest.approx([0.0, 5000.0])
+    assert site.wind_speeds == pytest.approx([5.0, 10.0])
+    assert pachon.Stamps.of_camera("lsst", jitter=1.0 * u.arcsec).jitter == pytest.approx(np.pi / 648000)
+    assert pachon.Air.at_humidity(0.5, pressure=750.0 * u.hPa).pressure == pytest.approx(75000.0)
+    with pytest.raises(DomainError, match=r"^altitudes = .*: expected a unit that converts to m"):
+        site.with_layers(altitudes=[0.0, 5.0] * u.s)
+
+
+def test_pixels_of_tables_are_pure_numbers():
+    """Tables of our own results have places in pixels, and functions that take such places refused them."""
+    assert pure_numbers([1.0, 2.0] * u.pix, "x").tolist() == [1.0, 2.0]
+    assert pachon.measure.match_positions([3.0] * u.pix, [4.0] * u.pix, [3.1], [4.0], 1.0).tolist() == [0]
+    for other in ([1.0] * u.m, [1.0] * u.mag, [1.0] * u.pix**2):
+        with pytest.raises(DomainError, match="expected real numbers without a unit"):
+            pure_numbers(other, "x")

@@ -109,6 +109,14 @@ def test_our_own_directions_agree_with_the_rays_and_each_other(telescope, ccd):
     assert np.abs(wcs.to_pixel(sky) - PIXELS).max() < 1e-8
 
 
+@pytest.mark.parametrize("dec", [0.5 * np.pi, -0.5 * np.pi])
+def test_headers_at_the_poles(telescope, dec):
+    """A reference at exactly 90 degrees has another default of LONPOLE, by which images stood upside down."""
+    wcs = ccd_wcs(telescope, CAMERA, "R22_S11", pointing=(RA, dec), position_angle=ROLL)
+    in_header = np.deg2rad(wcs.astropy().all_pix2world(PIXELS, 0))
+    assert separation(in_header, wcs.to_celestial(wcs.to_sky(PIXELS))) < TOLERANCE
+
+
 def test_the_order_is_the_lowest_that_is_good_enough(lsst_r):
     wcs = ccd_wcs(lsst_r, CAMERA, "R22_S11")
     assert (wcs.order, wcs.error < TOLERANCE) == (3, True)

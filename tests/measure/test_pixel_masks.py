@@ -5,7 +5,7 @@ import pytest
 
 import pachon
 from pachon.core.errors import DomainError
-from pachon.measure.pixel_masks import copied_pixels, fill_symmetric, weightless_pixels
+from pachon.measure.pixel_masks import clipped_level, copied_pixels, empty_pixels, fill_symmetric, weightless_pixels
 from pachon.measure.shapes import ShapeFlag, measure_shapes
 from pachon.measure.stamps import center_masks, center_stamps, decenter_masks
 from pachon.measure.star_selection import StarFlag, flag_stars
@@ -208,3 +208,31 @@ def test_models_take_stamps_with_pixels_that_are_not_finite(stars):
         assert model.mean.tobytes() == named.mean.tobytes()
     with pytest.raises(DomainError, match=r"stamps\[3\] has pixels that are not finite, and no others"):
         pachon.PsfModel.fit(np.where(np.arange(COUNT)[:, None, None] == 3, np.nan, noisy), places, **options)
+
+
+def test_the_level_of_clipped_pixels():
+    rng = np.random.default_rng(3)
+    image = np.rint(rng.normal(100.0, 5.0, (60, 60)))
+    image[14:45, 14:45] += 3000.0 / (1.0 + (X**2 + Y**2) / 16.0) ** 3
+    good = np.ones(image.shape, dtype=bool)
+    assert clipped_level(image, good) is None
+    clipped = np.minimum(image, 1000.0)
+    assert clipped_level(clipped, good) == 1000.0
+    assert clipped_level(clipped, good & (clipped < 1000.0)) is None
+    symmetric = np.zeros((60, 60))
+    symmetric[29:31, 29:31] = 1.0
+    for even in (symmetric, np.ones((60, 60)), np.full((60, 60), np.nan)):
+        assert clipped_level(even, np.isfinite(even)) is None
+
+
+def test_areas_of_zeros_are_no_measurements():
+    rng = np.random.default_rng(4)
+    y, x = np.indices((200, 240))
+    outside = (x + y < 90) | (x > 215)
+    noise = rng.normal(0.0, 3.0, x.shape)
+    assert np.array_equal(empty_pixels(np.where(outside, 0.0, noise)), outside)
+    # Zeros of whole numbers, of faint sky, and between objects without noise are measurements.
+    between = np.zeros(x.shape)
+    between[20:60, 20:60] = between[100:150, 90:140] = 1.0
+    for image in (noise, np.rint(0.3 * noise), rng.poisson(0.05, x.shape), between, np.zeros(x.shape)):
+        assert not empty_pixels(image).any()

@@ -61,3 +61,15 @@ def test_quantities_are_angles():
     assert np.allclose((aim.ra, aim.dec, aim.position_angle), (RA, DEC, ROLL), rtol=1e-15)
     with pytest.raises(DomainError, match=r"dec = 1\.0 kg: expected a unit that converts to rad"):
         pachon.Pointing(1.0, 1.0 * u.kg)
+
+
+@pytest.mark.parametrize("dec", [0.0, -1.2, 0.5 * np.pi - 0.01])
+def test_north_and_east_on_the_tangent_plane(dec):
+    aim = pachon.Pointing(RA, dec)
+    ra, dec = np.array([RA + 0.02, RA - 3.0]), np.array([dec - 0.015, min(dec + 0.01, 0.5 * np.pi - 0.002)])
+    ra, dec = ra[: 1 + (dec[0] > 1.0)], dec[: 1 + (dec[0] > 1.0)]  # the second lies beyond the pole
+    step = 1e-6
+    east = aim.from_celestial(ra + step / np.cos(dec), dec) - aim.from_celestial(ra - step / np.cos(dec), dec)
+    north = aim.from_celestial(ra, dec + step) - aim.from_celestial(ra, dec - step)
+    differences = np.stack([east, north], axis=2) / (2.0 * step)
+    assert np.allclose(aim.jacobians(ra, dec), differences, rtol=0, atol=1e-6)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import FK4, FK5, ICRS, SkyCoord
 from astropy.io import fits
+from astropy.nddata import CCDData, InverseVariance, StdDevUncertainty, VarianceUncertainty
 from astropy.wcs import WCS
 from drawn_fields import GAIN, SIDE, header_of, world
 from numpy.polynomial import chebyshev, legendre, polynomial
@@ -38,6 +39,49 @@ def test_a_plain_image_has_the_noise_that_it_shows(field, tmp_path):
     assert image.pixel_scale == pytest.approx(0.263 * ARCSEC, rel=1e-6)
     assert image.origins["gain"] == "GAIN"
     assert not image.mask.any()
+
+
+@pytest.mark.parametrize(
+    ("uncertainty", "power"), [(StdDevUncertainty, 0.5), (VarianceUncertainty, 1.0), (InverseVariance, -1.0)]
+)
+def test_uncertainties_of_astropy_are_of_their_kind(field, tmp_path, uncertainty, power):
+    """All were taken for rms: variances of bright pixels came out 15 times too large."""
+    noise = uncertainty(field.variance.astype(np.float64) ** power)
+    CCDData(field.image, unit="adu", wcs=WCS(world()), uncertainty=noise, meta={"GAIN": GAIN}).write(
+        tmp_path / "a.fits"
+    )
+    np.testing.assert_allclose(pachon.load_image(tmp_path / "a.fits").variance, field.variance, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["SCI", ""])
+def test_errors_count_before_weights(field, tmp_path, name):
+    """Drizzled images have both; from relative weights no gain follows."""
+    header = changed(GAIN=None, BUNIT="MJy/sr")
+    image = fits.ImageHDU(field.image, header, name=name)
+    errors = fits.ImageHDU(np.sqrt(field.variance), name="ERR")
+    weights = fits.ImageHDU(np.full(field.image.shape, 800.0), name="WHT")
+    loaded = pachon.load_image(write(tmp_path / "a.fits", fits.PrimaryHDU(), image, weights, errors))
+    np.testing.assert_allclose(loaded.variance, field.variance, rtol=1e-5)
+    assert loaded.gain == pytest.approx(GAIN, rel=0.02)
+
+
+def test_corners_of_zeros_are_masked(field, tmp_path):
+    """Resampled images have them; without a plane of weights they had "no noise"."""
+    outside = np.add(*np.indices(field.image.shape)) < 0.8 * SIDE
+    path = write(tmp_path / "a.fits", fits.PrimaryHDU(np.where(outside, np.float32(0.0), field.image), header_of()))
+    image = pachon.load_image(path)
+    assert np.array_equal(image.mask == BAD, outside)
+    assert np.median((image.variance / field.variance)[~outside]) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("cards", [{}, {"SATURATE": 65535.0}])
+def test_clipped_pixels_are_saturated_whatever_the_card(field, tmp_path, cards):
+    """Their stars made the PSF of an image wide, and its galaxies 20 % too elliptical."""
+    level = np.float32(0.5 * field.image.max())
+    path = write(tmp_path / "a.fits", fits.PrimaryHDU(np.minimum(field.image, level), header_of(**cards)))
+    image = pachon.load_image(path)
+    assert np.array_equal(image.mask == SATURATED, field.image >= level)
+    assert image.origins["saturation"] == "clipped pixels"
 
 
 def des_parts(field, compressed):
@@ -166,6 +210,7 @@ def test_images_of_one_name_have_the_planes_of_their_version(field, tmp_path):
 def test_pixels_without_a_value_have_no_weight(field, tmp_path):
     data, variance = field.image.copy(), field.variance.astype(np.float32)
     data[10:20], data[30, 30], variance[40], variance[50, 50] = np.nan, -np.inf, np.nan, 0.0
+    variance[60, 60] = 1e30  # SExtractor's, by which the detection found the image too bright
     write(
         tmp_path / "a.fits",
         fits.PrimaryHDU(),
@@ -173,10 +218,10 @@ def test_pixels_without_a_value_have_no_weight(field, tmp_path):
         fits.ImageHDU(variance, name="VAR"),
     )
     image = pachon.load_image(tmp_path / "a.fits")
-    for place in ((10, 3), (30, 30), (40, 7), (50, 50)):
+    for place in ((10, 3), (30, 30), (40, 7), (50, 50), (60, 60)):
         assert image.mask[place] == BAD
     assert np.isfinite(image.image).all()
-    assert (image.mask != 0).sum() == 10 * SIDE + 1 + SIDE + 1
+    assert (image.mask != 0).sum() == 10 * SIDE + 1 + SIDE + 2
     # An image without noise has no sky to measure.
     write(tmp_path / "b.fits", fits.PrimaryHDU(np.full((64, 64), 5.0), header_of()))
     with pytest.raises(ProductError, match="its pixels have no noise"):
@@ -302,6 +347,7 @@ def test_galactic_coordinates_and_swapped_axes(field, tmp_path, axes):
     [
         ({"EPOCH": 1950.0}, FK4(equinox="B1950")),
         ({"RADECSYS": "FK4"}, FK4(equinox="B1950")),
+        ({"RADESYS": "icrs"}, ICRS()),
         ({"RADECSYS": "FK5", "EQUINOX": 1975.0}, FK5(equinox="J1975")),
         ({"RADECSYS": "ICRS", "EQUINOX": 2000.0, "EPOCH": 1950.0}, ICRS()),
         ({"EPOCH": "survey"}, ICRS()),
@@ -336,6 +382,10 @@ def changed(**cards):
         (changed(CD1_1=0.0, CD2_1=0.0), {}, r"a\.fits: CD1_1, .*: expected a matrix with an inverse"),
         (changed(CTYPE1="RA---XYZ", CTYPE2="DEC--XYZ"), {}, r"a\.fits: CTYPE1 = RA---XYZ: expected world"),
         (changed(CTYPE1="LINEAR", CTYPE2="LINEAR"), {}, r"a\.fits: no world coordinates \(CTYPE1 = 'LINEAR'"),
+        # astropy takes ecliptic coordinates for those of ICRS, and has no frame for other systems.
+        (changed(CTYPE1="ELON-TAN", CTYPE2="ELAT-TAN"), {}, r"a\.fits: no world coordinates \(CTYPE1 = 'ELON-TAN'"),
+        (changed(BSOFTEN=3.0), {}, r"a\.fits: BSOFTEN = 3\.0: pixels are inverse hyperbolic sines .* expected linear"),
+        (changed(RADECSYS="J2000"), {}, r"a\.fits: RADECSYS = J2000: expected ICRS, FK5, FK4 or FK4-NO-E"),
         (
             changed(CTYPE2="RA---TAN"),
             {},

@@ -14,9 +14,11 @@ from pachon.models.camera.cameras import load_camera
 from pachon.pipeline.config import configuration_of
 from pachon.pipeline.listed_visit import ground_wind, telescope_of_band, visit_cards, visit_experiment
 from pachon.pipeline.simulate.photometry import limiting_magnitude, saturation_magnitude
+from pachon.sky.sky_shapes import along_sky
 from pachon.sky.visit_list.visit_list import ListedVisit
 from pachon.studies.night import detector_row
 from pachon.studies.night.night_files import write_named_table
+from pachon.studies.night.sky_pixels import interpolated
 
 
 def listed(**changes):
@@ -100,6 +102,20 @@ def test_effective_time(experiment):
     sigma = 0.73 / 0.2 / (2 * math.sqrt(2 * math.log(2)))
     time = detector_row.effective_time(nominal, sigma, columns["skyBg"], columns["zeroPoint"], 1.0)
     assert time == pytest.approx(30.0)
+
+
+@pytest.mark.parametrize("count", [4, 8, 30])
+def test_shapes_of_maps_at_the_pole(count):
+    """The axes of the sky turn within a CCD there: a polynomial of shapes along them was wrong by up to twice g."""
+    camera, rng = load_camera("lsst"), np.random.default_rng(5)
+    xy, at = (camera.from_pixel(94, rng.uniform(0.0, 4095.0, (n, 2))) for n in (count, 20))
+    g1, g2 = np.full((2, count), [[0.1], [0.03]])
+    places = detector_row.PlaceShapes(xy=xy, sigma=np.full(count, 2.0), g1=g1, g2=g2, area=np.full(count, 40.0))
+    longitudes = np.arctan2(*(at - camera.centers[94]).T)
+    cosine, sine = np.cos(longitudes), np.sin(longitudes)
+    jacobians = np.stack([cosine, -sine, sine, cosine], axis=1).reshape(-1, 2, 2)
+    expected = [np.full(20, 2.0), *along_sky(np.full(20, 0.1), np.full(20, 0.03), jacobians), np.full(20, 40.0)]
+    np.testing.assert_allclose(interpolated(camera, 94, places, jacobians, at).T, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("altitude", [0.7, 1.1, 1.5])
