@@ -392,6 +392,7 @@ def changed(name, index, value):
         (changed("seeingFwhm500", 2, ""), "visit 1003: seeingfwhm500 = nothing: expected a width above 0"),
         (changed("seeingFwhm500", 2, 0.02), "visit 1003: seeing = 0.02 arcsec: expected at least 0.0401 arcsec"),
         (changed("band", 4, "w"), "visit 1005: band = w: expected one of u, g, r, i, z, y"),
+        (changed("band", 4, "gr"), "visit 1005: band = gr: expected one of u, g, r, i, z, y"),
         (changed("fieldDec", 0, 70.0), "visit 1001: altitude = -1"),
         (changed("fieldDec", 0, 95.0), "visit 1001: fielddec = 95 deg: expected -90 to 90 deg"),
         (changed("visitExposureTime", 0, -3.0), "visit 1001: visitexposuretime = -3 s: expected a time above 0 s"),
