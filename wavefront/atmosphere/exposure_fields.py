@@ -42,8 +42,8 @@ NOLL = range(4, 16)
 #: Side of the periodic grids over the diameter of the field.
 _MARGIN = 1.5
 #: Difference of covariances between directions half a period away, over the variance that changes over the field, from
-#: which lags beyond count too: drift in the exposure, or a low layer, is longer than a period. Cut off there, spectra of
-#: HSC and of the AuxTel in 30 s have negative parts of 7 %, and half-variograms at 1 arcmin are up to 22 % too large.
+#: which lags beyond count too: drift in the exposure, or a low layer, is longer than a period. Cut off there, spectra
+#: of HSC and of the AuxTel in 30 s have negative parts of 7 %, and half-variograms at 1 arcmin are 22 % too large.
 _UNEVEN = 0.02
 #: Samples in the angle under which the highest layer crosses the pupil, at least. Half-variograms of the LSST's moments
 #: from 0.5 arcmin on are those of the theory within 4 %, from 0.75 arcmin on within 2 %.

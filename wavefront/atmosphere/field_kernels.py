@@ -95,7 +95,7 @@ def spread_over_grid(
         signed = wp.where(column > size / 2, column - size, column)
         x = per_spacing * wp.float32(signed)
         value = pairs()
-        if images:
+        if images:  # noqa: SIM108 - a conditional expression of Warp computes both
             value = with_images(x, y, per_spacing * wp.float32(size), polar, step)
         else:
             value = at_lag(x, y, polar, step)
