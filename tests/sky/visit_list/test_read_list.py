@@ -331,6 +331,17 @@ def test_without_rottelpos_it_follows_from_the_camera(visits, write_list):
         assert "no rotTelPos" in " ".join(listed.remarks)
 
 
+def test_visits_without_rottelpos_beside_others(visits, write_list):
+    sky = (np.rad2deg(visits.zenith_position_angle) - column("rotTelPos") - 90) % 360
+    mixed = changed("rotTelPos", slice(2), ["", ""])
+    listed = read_visit_list(write_list(rotSkyPos=sky, **mixed))
+    np.testing.assert_allclose(listed.rotator, visits.rotator, atol=1e-9)
+    assert "2 of 5 visits have no rotTelPos: it is q - rotSkyPos - 90 deg, as of LSSTCam" in listed.remarks
+    assert any("rotTelPos is taken" in remark for remark in listed.remarks)
+    with pytest.raises(DomainError, match="visit 1002: rottelpos = nothing: expected a finite angle"):
+        read_visit_list(write_list(rotSkyPos=[sky[0], "", *sky[2:]], **mixed))
+
+
 @pytest.mark.parametrize(
     ("sign", "offset", "name"), [(-1, -90, "LSSTCam"), (-1, 0, "ComCam"), (1, 0, "imSim's first lists")]
 )
