@@ -43,8 +43,8 @@ def sky_rotations(rotator: np.ndarray, zenith: np.ndarray, camera: str) -> np.nd
 def rotator_angles(columns: ListColumns, zenith: np.ndarray, camera: str) -> np.ndarray:
     """Return the angles of the rotator [rad], -pi to pi; remarks say by which convention the list has those on the sky.
 
-    Where a visit has no rotTelPos they follow from rotSkyPos by the convention of the camera. A list that states the position angle
-    of the telescope may have neither: its camera stands still.
+    Where a visit has no rotTelPos they follow from rotSkyPos by the convention of the camera. A list that states the
+    position angle of the telescope may have neither: its camera stands still.
     """
     sky = columns.numbers("sky_rotation")
     if "rotator" in columns.values:
