@@ -487,6 +487,11 @@ def test_units_that_cannot_be(tmp_path, name, unit, message):
         read_visit_list(path)
 
 
+def test_columns_that_are_not_taken_may_have_anything(visits, write_list):
+    listed = read_visit_list(write_list(paraAngle=["12d30m"] * 5))
+    assert listed.digest == visits.digest
+
+
 def test_small_outer_scales_allow_less(write_list):
     with pytest.raises(DomainError, match=r"expected at least .* with an outer scale of 1 m"):
         read_visit_list(write_list(outer_scale=[1.0] * 5))
