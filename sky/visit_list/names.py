@@ -30,7 +30,6 @@ QUANTITIES = {
     "rotator": ListedQuantity("angle of the rotator", "deg", ("rottelpos", "physical_rotator_angle", "rotator_deg")),
     "sky_rotation": ListedQuantity("angle of the camera on the sky", "deg", ("rotskypos", "sky_rotation")),
     "roll": ListedQuantity("position angle of the telescope", "deg", ("roll_deg", "position_angle_deg")),
-    "parallactic": ListedQuantity("parallactic angle", "deg", ("paraangle",)),
     "altitude": ListedQuantity("altitude", "deg", ("altitude",)),
     "zenith_distance": ListedQuantity("zenith distance", "deg", ("zenith_distance", "zenithdistance")),
     "azimuth": ListedQuantity("azimuth", "deg", ("azimuth",)),

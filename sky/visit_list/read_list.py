@@ -12,7 +12,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, check_choice, error_context
 from ...core.number_text import counted
 from ...core.statistics import FWHM_PER_RMS
-from ...core.units import ARCSEC
+from ...core.units import ARCSEC, require_positive
 from ...models.io.site_file import load_site
 from .list_columns import ListColumns
 from .list_table import open_list
@@ -32,7 +32,7 @@ _ALTITUDE_DIFFERENCE = np.deg2rad(1.0)
 #: Numbers from which a night is a date YYYYMMDD.
 _FIRST_DATE = 10_000_000
 # Bands by their numbers in instance catalogues.
-_BANDS = "ugrizy"
+_BANDS = tuple("ugrizy")
 # Angle of an LSST pixel, in which ConsDB has widths [rad].
 _CONSDB_PIXEL = 0.2 * ARCSEC
 _SECONDS_A_DAY = 86400.0
@@ -50,6 +50,7 @@ def read_visit_list(
     camera: str = "lsst",
     site: str = "cerro_pachon",
     airmass_law: Literal["von_karman", "opsim"] = "von_karman",
+    outer_scale: float | None = None,
 ) -> VisitList:
     """Read the visits of a scheduler, an observatory or a catalogue.
 
@@ -74,6 +75,8 @@ def read_visit_list(
     airmass_law : {"von_karman", "opsim"}
         Seeing away from the zenith: that of turbulence with an outer scale, whose r0 falls as airmass^-0.6; or the
         seeing at the zenith times airmass^0.6, to which r0 is then fitted.
+    outer_scale : float, optional
+        Outer scale of lists without one [m]; that of the site by default.
 
     Returns
     -------
@@ -92,7 +95,11 @@ def read_visit_list(
     """
     path = Path(path)
     check_choice("airmass_law", airmass_law, AIRMASS_LAWS)
-    location, outer_scale = location_of(site), float(load_site(site).outer_scale)
+    location = location_of(site)
+    if outer_scale is None:
+        outer_scale = float(load_site(site).outer_scale)
+    else:
+        require_positive(outer_scale, "outer_scale")
     with error_context(file=path), open_list(path) as table:
         columns = ListColumns.of(table, where)
         if not len(columns):
@@ -219,7 +226,7 @@ def _bands(columns: ListColumns) -> np.ndarray:
     """Return the bands, u to y; DomainError names the first visit with another."""
     columns.require("band")
     names = _band_names(columns)
-    wrong = np.flatnonzero([name not in _BANDS or not name for name in names])
+    wrong = np.flatnonzero(~np.isin(names, _BANDS))
     if wrong.size:
         name = columns.source["band"]
         value = f"{name} = {columns.values['band'][wrong[0]]}"
@@ -237,7 +244,7 @@ def _band_names(columns: ListColumns) -> np.ndarray:
             names.append(_BANDS[index] if 0 <= index < len(_BANDS) and index == value else str(value))
             continue
         word = re.split(r"[\s_~]", value.strip(), maxsplit=1)[0]
-        names.append(word.lower() if len(word) == 1 and word.lower() in _BANDS else value.strip())
+        names.append(word.lower() if word.lower() in _BANDS else value.strip())
     return np.array(names)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...core.number_text import counted
 from .list_columns import ListColumns
 
 #: Largest typical difference with which a list follows a convention [rad]: q of schedulers lacks precession.
@@ -42,24 +43,36 @@ def sky_rotations(rotator: np.ndarray, zenith: np.ndarray, camera: str) -> np.nd
 def rotator_angles(columns: ListColumns, zenith: np.ndarray, camera: str) -> np.ndarray:
     """Return the angles of the rotator [rad], -pi to pi; remarks say by which convention the list has those on the sky.
 
-    Without rotTelPos they follow from rotSkyPos by the convention of the camera. A list that states the position angle
-    of the telescope may have neither: its camera stands still.
+    Where a visit has no rotTelPos they follow from rotSkyPos by the convention of the camera. A list that states the
+    position angle of the telescope may have neither: its camera stands still.
     """
     sky = columns.numbers("sky_rotation")
     if "rotator" in columns.values:
-        rotator = columns.complete("rotator", lambda angle: np.abs(angle) <= 4.0 * np.pi, "a finite angle")
-        if np.isfinite(sky).any():
-            columns.remarks.append(_agreement(rotator, sky, zenith))
-        return wrapped(rotator)
-    if "roll" in columns.values and "sky_rotation" not in columns.values:
+        rotator = columns.numbers("rotator")
+        from_sky = np.isnan(rotator) & np.isfinite(sky)
+        columns.rows(~from_sky).complete("rotator", _is_angle, "a finite angle")
+        both = np.where(from_sky, np.nan, sky)
+        if np.isfinite(both).any():
+            columns.remarks.append(_agreement(rotator, both, zenith))
+    elif "roll" in columns.values and "sky_rotation" not in columns.values:
         return np.zeros(len(columns))
-    columns.require("rotator", "sky_rotation")
-    sky = columns.complete("sky_rotation", lambda angle: np.abs(angle) <= 4.0 * np.pi, "a finite angle")
+    else:
+        columns.require("rotator", "sky_rotation")
+        rotator, from_sky = np.zeros(len(columns)), np.ones(len(columns), dtype=bool)
+    if not from_sky.any():
+        return wrapped(rotator)
+    columns.rows(from_sky).complete("sky_rotation", _is_angle, "a finite angle")
     is_comcam = camera == _COMCAM
     formula = "q - rotSkyPos" if is_comcam else "q - rotSkyPos - 90 deg"
-    columns.remarks.append(f"no rotTelPos: it is {formula}, as of {'ComCam' if is_comcam else 'LSSTCam'}")
+    extent = "" if from_sky.all() else f"{from_sky.sum()} of {counted(len(columns), 'visit has', 'visits have')} "
+    columns.remarks.append(f"{extent}no rotTelPos: it is {formula}, as of {'ComCam' if is_comcam else 'LSSTCam'}")
     # Angles on the sky and of the rotator follow from each other in the same way.
-    return sky_rotations(sky, zenith, camera)
+    return np.where(from_sky, sky_rotations(sky, zenith, camera), wrapped(rotator))
+
+
+def _is_angle(angle: np.ndarray) -> np.ndarray:
+    """Return whether angles [rad] are of at most two turns."""
+    return np.asarray(np.abs(angle) <= 4.0 * np.pi)
 
 
 def _agreement(rotator: np.ndarray, sky: np.ndarray, zenith: np.ndarray) -> str:

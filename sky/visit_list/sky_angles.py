@@ -53,6 +53,7 @@ def sky_angles(ra: np.ndarray, dec: np.ndarray, mjd_tai: np.ndarray, location: L
     """
     from astropy import units as u
     from astropy.coordinates import AltAz, EarthLocation, SkyCoord
+    from astropy.coordinates.erfa_astrom import ErfaAstrom, erfa_astrom
     from astropy.time import Time
     from astropy.utils import iers
 
@@ -68,9 +69,13 @@ def sky_angles(ra: np.ndarray, dec: np.ndarray, mjd_tai: np.ndarray, location: L
         warnings.simplefilter("ignore")
         frame = AltAz(obstime=Time(mjd_tai, format="mjd", scale="tai"), location=place)
         pointing = SkyCoord(ra * u.rad, dec * u.rad)
-        horizontal = pointing.transform_to(frame)
-        # Downwards: upwards would leave the sphere where the pointing is at the zenith.
-        below = SkyCoord(alt=horizontal.alt - _STEP * u.arcsec, az=horizontal.az, frame=frame).icrs
+        # Where the Earth is takes most of the time of a long list, and is the same for both ways.
+        earth, of_earth = ErfaAstrom(), ErfaAstrom.apco(frame)
+        vars(earth)["apco"] = lambda _: of_earth
+        with erfa_astrom.set(earth):
+            horizontal = pointing.transform_to(frame)
+            # Downwards: upwards would leave the sphere where the pointing is at the zenith.
+            below = SkyCoord(alt=horizontal.alt - _STEP * u.arcsec, az=horizontal.az, frame=frame).icrs
         towards_horizon = pointing.position_angle(below).rad
     zenith = (towards_horizon + 2.0 * np.pi) % (2.0 * np.pi) - np.pi
     return SkyAngles(horizontal.alt.rad, horizontal.az.rad, zenith)

@@ -120,7 +120,7 @@ def read_section(settings: ListSection, run: Configuration, folder: Path | None 
     path = (folder or Path()) / str(settings.list)
     camera = run.camera or ("comcam" if "comcam" in (run.telescope or "") else "lsst")
     selection = settings.where, settings.band, settings.night
-    visits = _visits_of(path, _state_of(path), selection, camera, _site_of(run, folder), settings.airmass_law)
+    visits = _visits_of(path, _state_of(path), selection, camera, _air_of(run, folder), settings.airmass_law)
     if settings.digest not in (None, visits.digest):
         raise ProductError("the list has changed: expected the visits of the digest of the configuration", file=path)
     return visits
@@ -129,11 +129,25 @@ def read_section(settings: ListSection, run: Configuration, folder: Path | None 
 # A database of ten years takes seconds to read: settings are made of it, and then the plan of the visits.
 @lru_cache(maxsize=2)
 def _visits_of(
-    path: Path, state: object, selection: tuple[Any, Any, Any], camera: str, site: str, airmass_law: Any
+    path: Path,
+    state: object,
+    selection: tuple[Any, Any, Any],
+    camera: str,
+    air: tuple[str, float | None],
+    airmass_law: Any,
 ) -> VisitList:
     """Read the list in a file of a state."""
-    where, band, night = selection
-    return read_visit_list(path, where=where, band=band, night=night, camera=camera, site=site, airmass_law=airmass_law)
+    (where, band, night), (site, outer_scale) = selection, air
+    return read_visit_list(
+        path,
+        where=where,
+        band=band,
+        night=night,
+        camera=camera,
+        site=site,
+        airmass_law=airmass_law,
+        outer_scale=outer_scale,
+    )
 
 
 def _state_of(path: Path) -> tuple[int, int] | None:
@@ -145,13 +159,19 @@ def _state_of(path: Path) -> tuple[int, int] | None:
     return status.st_mtime_ns, status.st_size
 
 
-def _site_of(run: Configuration, folder: Path | None) -> str:
-    """Return the bundled site of a run's telescope, or the path of a site file."""
+def _air_of(run: Configuration, folder: Path | None) -> tuple[str, float | None]:
+    """Return the bundled site at which a run's telescope stands, and the outer scale of its air if it is another.
+
+    A site file has layers and an outer scale, but no place.
+    """
     from ...models.io.prescription import load_telescope
+    from ...models.io.site_file import BUNDLED, load_site
 
     from_folder = partial(path_beside, folder or Path())
-    if run.atmosphere.site is not None:
-        return from_folder(run.atmosphere.site)
-    if run.telescope is None:
-        return "cerro_pachon"
-    return load_telescope(from_folder(run.telescope)).site or "cerro_pachon"
+    site, outer_scale = run.atmosphere.site, run.atmosphere.outer_scale_m
+    if site in BUNDLED:
+        return site, outer_scale
+    if site is not None and outer_scale is None:
+        outer_scale = float(load_site(from_folder(site)).outer_scale)
+    telescope = None if run.telescope is None else load_telescope(from_folder(run.telescope))
+    return (telescope and telescope.site) or "cerro_pachon", outer_scale

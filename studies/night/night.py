@@ -137,6 +137,10 @@ def run_night(
     missing = tuple(visit for visit in paths if visit not in finished)
     with reporter.stage("tables and maps"):
         left_out, summary = write(_read(paths, finished, stamp), complete=not missing)
+    if len(left_out) == len(visits):
+        first, reason = next(iter(left_out.items()))
+        count = counted(len(visits), "visit")
+        raise DomainError(f"none of {count} has a PSF; visit {first}: {reason}", file=visits.source)
     return NightResult(folder, visits, left_out, missing, summary)
 
 
@@ -209,5 +213,7 @@ def claim_night(folder: Path, config: NightConfig, *, resume: bool) -> None:
         noun="a night",
         now=config.as_dict(),
         read=lambda path: load_night_configuration(path).as_dict(),
+        # The digest tells the visits, wherever their file lies now.
+        free_keys=[f"visits.{key}" for key in ("list", "where", "band", "night")],
         wanted=resume,
     )

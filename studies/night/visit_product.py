@@ -140,7 +140,7 @@ class VisitWork:
             measured = fit.holdout if isinstance(fit, CcdFit) else None
             shapes = rows.place_shapes(experiment, exposure.positions.holdout, exposure.holdout, measured)
             if not np.isfinite(shapes.sigma[0]):
-                raise DomainError("the PSF in its middle has no shape: expected a CCD within the field")
+                raise DomainError("the PSF in its middle has no shape: expected light there, wider than a pixel")
             if isinstance(fit, PachonError):
                 raise fit
             if isinstance(model, CcdProduct):

@@ -50,19 +50,43 @@ def at_lag(x: wp.float32, y: wp.float32, polar: wp.array2d(dtype=pairs), step: w
     return value
 
 
+@wp.func
+def cell_mean(turns: wp.float32):
+    """Factor of a covariance at a lag, in sides of a grid, by the mean of its spectrum over a cell of frequencies."""
+    phase = wp.float32(wp.PI) * turns
+    return wp.where(wp.abs(turns) < wp.float32(1e-4), wp.float32(1.0), wp.sin(phase) / phase)
+
+
+@wp.func
+def with_images(x: wp.float32, y: wp.float32, side: wp.float32, polar: wp.array2d(dtype=pairs), step: wp.float32):
+    """Covariances at a lag of a process that repeats with a side: means of its spectrum over cells of frequencies.
+
+    Of the images of the lag those beyond one side and a half are left out.
+    """
+    value = pairs()
+    for i in range(3):
+        for j in range(3):
+            along = x + wp.float32(i - 1) * side
+            across = y + wp.float32(j - 1) * side
+            value = value + cell_mean(along / side) * cell_mean(across / side) * at_lag(along, across, polar, step)
+    return value
+
+
 @wp.kernel
 def spread_over_grid(
     first: wp.int32,
     polar: wp.array2d(dtype=pairs),
     per_spacing: wp.float32,
     step: wp.float32,
+    images: wp.bool,
     grid: wp.array3d(dtype=wp.float32),
 ):
     """Interpolate covariances from rings and spokes of lags to one row of a periodic grid.
 
     Arguments: polar [ring, spoke]: rings at exp(step k) - 1 in units of the first scale, spokes evenly over half a
-    turn, after which the covariances are the same; per_spacing: spacing of the grid in that unit; grid [pair, row,
-    column] of rows 0 to n/2, to whose opposites the others are equal.
+    turn, after which the covariances are the same; per_spacing: spacing of the grid in that unit; images: whether lags
+    beyond the grid count, see :func:`with_images`; grid [pair, row, column] of rows 0 to n/2, to whose opposites the
+    others are equal.
     """
     row = first + wp.tid()
     size = grid.shape[2]
@@ -70,7 +94,11 @@ def spread_over_grid(
     for column in range(size):
         signed = wp.where(column > size / 2, column - size, column)
         x = per_spacing * wp.float32(signed)
-        value = at_lag(x, y, polar, step)
+        value = pairs()
+        if images:  # noqa: SIM108 - a conditional expression of Warp computes both
+            value = with_images(x, y, per_spacing * wp.float32(size), polar, step)
+        else:
+            value = at_lag(x, y, polar, step)
         for pair in range(6):
             grid[pair, row, column] = value[pair]
 

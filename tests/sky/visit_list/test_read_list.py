@@ -331,6 +331,17 @@ def test_without_rottelpos_it_follows_from_the_camera(visits, write_list):
         assert "no rotTelPos" in " ".join(listed.remarks)
 
 
+def test_visits_without_rottelpos_beside_others(visits, write_list):
+    sky = (np.rad2deg(visits.zenith_position_angle) - column("rotTelPos") - 90) % 360
+    mixed = changed("rotTelPos", slice(2), ["", ""])
+    listed = read_visit_list(write_list(rotSkyPos=sky, **mixed))
+    np.testing.assert_allclose(listed.rotator, visits.rotator, atol=1e-9)
+    assert "2 of 5 visits have no rotTelPos: it is q - rotSkyPos - 90 deg, as of LSSTCam" in listed.remarks
+    assert any("rotTelPos is taken" in remark for remark in listed.remarks)
+    with pytest.raises(DomainError, match="visit 1002: rottelpos = nothing: expected a finite angle"):
+        read_visit_list(write_list(rotSkyPos=[sky[0], "", *sky[2:]], **mixed))
+
+
 @pytest.mark.parametrize(
     ("sign", "offset", "name"), [(-1, -90, "LSSTCam"), (-1, 0, "ComCam"), (1, 0, "imSim's first lists")]
 )
@@ -392,6 +403,7 @@ def changed(name, index, value):
         (changed("seeingFwhm500", 2, ""), "visit 1003: seeingfwhm500 = nothing: expected a width above 0"),
         (changed("seeingFwhm500", 2, 0.02), "visit 1003: seeing = 0.02 arcsec: expected at least 0.0401 arcsec"),
         (changed("band", 4, "w"), "visit 1005: band = w: expected one of u, g, r, i, z, y"),
+        (changed("band", 4, "gr"), "visit 1005: band = gr: expected one of u, g, r, i, z, y"),
         (changed("fieldDec", 0, 70.0), "visit 1001: altitude = -1"),
         (changed("fieldDec", 0, 95.0), "visit 1001: fielddec = 95 deg: expected -90 to 90 deg"),
         (changed("visitExposureTime", 0, -3.0), "visit 1001: visitexposuretime = -3 s: expected a time above 0 s"),
@@ -473,6 +485,11 @@ def test_units_that_cannot_be(tmp_path, name, unit, message):
     table.write(path)
     with pytest.raises(DomainError, match=message):
         read_visit_list(path)
+
+
+def test_columns_that_are_not_taken_may_have_anything(visits, write_list):
+    listed = read_visit_list(write_list(paraAngle=["12d30m"] * 5))
+    assert listed.digest == visits.digest
 
 
 def test_small_outer_scales_allow_less(write_list):

@@ -15,11 +15,14 @@ from pachon.commands.night import listed_visit
 from pachon.core.errors import ConfigError, DomainError, ProductError
 from pachon.core.long_work import Execution
 from pachon.core.products import read_fits
+from pachon.core.units import ARCSEC
 from pachon.imaging.wcs import ccd_wcs
+from pachon.models.io.bundled import DATA
 from pachon.pipeline.listed_visit import check_bands, visit_experiment
+from pachon.sky.visit_list.seeing import fried_parameter
 from pachon.studies.night.config import NightConfig
 from pachon.studies.night.maps import NightMaps
-from pachon.studies.night.night import run_night
+from pachon.studies.night.night import claim_night, run_night
 from pachon.studies.night.visit_product import VisitWork
 
 pytestmark = pytest.mark.long
@@ -50,6 +53,16 @@ def test_a_visit_that_fails_is_left_out(night):
     summary = json.loads((result.folder / "summary.json").read_text())
     assert (summary["visits"], summary["finished"], summary["complete"]) == (3, 3, True)
     assert list(summary["left_out"]) == ["1002"]
+
+
+def test_a_night_without_a_psf_is_an_error(night_config, tmp_path, monkeypatch):
+    def no_light(*_):
+        raise DomainError("no light")
+
+    monkeypatch.setattr(VisitWork, "_product", no_light)
+    with pytest.raises(DomainError, match=r"visits.csv: none of 3 visits has a PSF; visit 1001: no light"):
+        run_night(night_config(models=False, maps={"nside": 0}), tmp_path, execution=Execution(threads=1))
+    assert list(json.loads((tmp_path / "summary.json").read_text())["left_out"]) == ["1001", "1002", "1003"]
 
 
 def test_sky_rotation_of_the_table_is_that_of_images(night):
@@ -214,6 +227,33 @@ def test_a_list_that_has_changed_is_refused(night, night_config):
             stream.write(text)
     with pytest.raises(ProductError, match="go on with --resume"):
         run_night(config, result.folder)
+
+
+def test_a_list_that_has_moved_is_the_same(night_config, tmp_path):
+    """The digest tells the visits: neither the place of their file nor how they are chosen is of the night."""
+    config = night_config()
+    moved = shutil.copy(config.visits.list, tmp_path / "moved.csv")
+    again = config.visits.model_copy(update={"list": str(moved), "where": "observationId < 2000"})
+    visits = config.read_list()
+    nights = [config, config.model_copy(update={"visits": again})]
+    for night in nights:
+        experiment = visit_experiment(night.run, visits[0])
+        claim_night(tmp_path / "night", night.started(visits, experiment), resume=True)
+    opsim = again.model_copy(update={"airmass_law": "opsim"})
+    with pytest.raises(ProductError, match="airmass_law"):
+        claim_night(
+            tmp_path / "night", config.model_copy(update={"visits": opsim}).started(visits, experiment), resume=True
+        )
+
+
+def test_outer_scale_of_a_list_without_one(night_config, tmp_path):
+    """That of the configuration was replaced by that of the telescope's site, and a site file was refused."""
+    site = (DATA / "cerro_pachon.yaml").read_text()
+    (tmp_path / "mine.yaml").write_text(site.replace("outer_scale: 25.0", "outer_scale: 40.0"))
+    for air, scale in (({}, 25.0), ({"outer_scale_m": 50.0}, 50.0), ({"site": "mine.yaml"}, 40.0)):
+        visits = night_config({"atmosphere": air}).read_list(tmp_path)
+        assert visits.outer_scale.tolist() == [scale] * 3
+        assert visits.r0[0] == pytest.approx(fried_parameter(np.array([0.72 * ARCSEC]), np.array([scale]))[0])
 
 
 def test_bands_that_the_telescope_has_not(night_config, tmp_path):

@@ -44,6 +44,31 @@ def test_spectra_of_moments_have_the_covariances():
 
 
 @pytest.mark.long
+def test_low_layers_are_longer_than_the_period_of_a_narrow_field():
+    """Cut off half a period away, covariances gave half-variograms that were 1.2 to 1.7 times too large.
+
+    They are means over directions, of the variance that the factors have at the samples.
+    """
+    air = AIR._replace(
+        altitudes=(0.0, 1000.0, 8000.0), weights=(0.5, 0.3, 0.2), velocities=((0.0, 0.0), (-4.0, 3.0), (8.0, -6.0))
+    )
+    grid = FieldGrid.of(air, FIELD_RADIUS)
+    factors, _, _ = moment_spectrum(air, RESPONSE, grid)
+    gain = exposure_fields._spline_gain(grid.size)
+    gain = gain[:, None] * gain[: grid.size // 2 + 1]
+    squares = [sum((f / gain) ** 2 for f in row) for row in factors]
+    covariance = np.fft.irfft2(squares, s=(grid.size, grid.size))
+    angle = math.pi * np.arange(12) / 12
+    for pupils in (0.7, 1.5, 4.0):
+        radius = 4.5 * pupils
+        steps = np.rint(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)).astype(int)
+        lags = np.concatenate([np.zeros((1, 2)), steps]) * grid.side / grid.size
+        theory = moment_covariance(air, lags).total(RESPONSE)[:, :3]
+        drawn = covariance[:, :1, 0] - covariance[:, steps[:, 1] % grid.size, steps[:, 0] % grid.size]
+        assert drawn.mean(axis=1) == pytest.approx((theory[0] - theory[1:]).mean(axis=0), rel=0.04, abs=0.0)
+
+
+@pytest.mark.long
 def test_half_variograms_between_samples():
     """Differences of drawn moments at places between samples, at a third of the pupil's angle and more.
 
@@ -167,7 +192,7 @@ def test_ground_layer_is_the_same_for_all_stars():
     draws = np.array([exposure_fields._draw_wavefronts(air, FieldGrid(16, 0.01), s, 0)[0] for s in range(60)])
     theory = mean_wavefront_covariance(air, (0.0, 0.0), NOLL, air.diameter, air.obscuration)[0, :, 0]
     # 60 draws: four standard errors of a variance, of eight.
-    assert (draws**2).mean(axis=0) == pytest.approx(np.diag(theory), rel=0.73)
+    assert (draws**2).mean(axis=0) == pytest.approx(np.diag(theory), rel=0.73, abs=0.0)
     assert ground.tobytes() == exposure_fields._draw_wavefronts(air, FieldGrid(16, 0.01), 3, 0)[0].tobytes()
 
 
