@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -69,10 +69,15 @@ def sky_angles(ra: np.ndarray, dec: np.ndarray, mjd_tai: np.ndarray, location: L
         warnings.simplefilter("ignore")
         frame = AltAz(obstime=Time(mjd_tai, format="mjd", scale="tai"), location=place)
         pointing = SkyCoord(ra * u.rad, dec * u.rad)
-        # Where the Earth is takes most of the time of a long list, and is the same for both ways.
-        earth, of_earth = ErfaAstrom(), ErfaAstrom.apco(frame)
-        vars(earth)["apco"] = lambda _: of_earth
-        with erfa_astrom.set(earth):
+        of_earth = ErfaAstrom.apco(frame)
+
+        class EarthOfFrame(ErfaAstrom):
+            """Where the Earth is takes most of the time of a long list, and is the same for both ways."""
+
+            def apco(self, frame_or_coord: Any) -> Any:
+                return of_earth
+
+        with erfa_astrom.set(EarthOfFrame()):
             horizontal = pointing.transform_to(frame)
             # Downwards: upwards would leave the sphere where the pointing is at the zenith.
             below = SkyCoord(alt=horizontal.alt - _STEP * u.arcsec, az=horizontal.az, frame=frame).icrs
