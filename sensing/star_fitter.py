@@ -159,6 +159,11 @@ class StarFitter:
         return ny, nx
 
     @property
+    def fits_wavefront(self) -> bool:
+        """Whether the wavefront is unknown."""
+        return self._wavefront
+
+    @property
     def light(self) -> StarLight:
         """Light of the star."""
         return self._light
@@ -225,10 +230,10 @@ class StarFitter:
                 return rays
         return self._rays.setdefault(across, self.instrument.rays(light, across))
 
-    def without_wavefront(self) -> StarFitter:
-        """Return the same without unknowns of the wavefront, which is zero."""
+    def of_first_terms(self, count: int) -> StarFitter:
+        """Return the same with so many of the first unknowns of the wavefront; the others are zero."""
         fitter = copy(self)
-        fitter._map = self._map[:, :, :0]
+        fitter._map = self._map[:, :, :count]
         return fitter
 
     def central(self, shape: tuple[int, int]) -> StarFitter:
