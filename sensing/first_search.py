@@ -20,18 +20,32 @@ _LIKELY = 0.3e-6
 
 def first_solution(fitter: StarFitter, start: Start) -> Solution:
     """Return the best solution from a start; of a small image also from the seeing that it has without aberrations."""
-    tolerance = COARSE if fitter.donut else FINE
-    best = fitter.solve(start.stamp, start.unknowns, tolerance=tolerance)
+    best = _by_low_terms(fitter, start, start.unknowns)
     if not _is_small(fitter, start, best):
         return best
-    plain = fitter.without_wavefront().solve(start.stamp, start.unknowns, tolerance=tolerance)
-    from_plain = fitter.solve(start.stamp, plain.stars[0], tolerance=tolerance)
+    tolerance = COARSE if fitter.donut else FINE
+    plain = fitter.of_first_terms(0).solve(start.stamp, start.unknowns, tolerance=tolerance)
+    from_plain = _by_low_terms(fitter, start, plain.stars[0])
 
     def loss(fit: Solution) -> float:
         wave = fit.shared[: len(fitter.instrument.noll)]
         return fit.loss + float(wave @ wave) / _LIKELY**2
 
     return min(best, from_plain, key=loss)
+
+
+def _by_low_terms(fitter: StarFitter, start: Start, unknowns: np.ndarray) -> Solution:
+    """Return the best solution from unknowns of a star without aberrations, by low terms of these first.
+
+    Beside what a template lacks the priors of further terms count for nothing, and these lead to other solutions.
+    """
+    tolerance = COARSE if fitter.donut else FINE
+    count = fitter.instrument.terms.first_low
+    if not (fitter.donut and fitter.fits_wavefront and count):
+        return fitter.solve(start.stamp, unknowns, tolerance=tolerance)
+    low = fitter.of_first_terms(count).solve(start.stamp, unknowns, tolerance=tolerance)
+    shared = np.pad(low.shared, (0, len(fitter.precision) - count))
+    return fitter.solve(start.stamp, low.stars[0], shared, tolerance)
 
 
 def _is_small(fitter: StarFitter, start: Start, solution: Solution) -> bool:

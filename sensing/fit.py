@@ -21,7 +21,7 @@ from ..wavefront.psf.light import Light
 from .amplifier_steps import AmplifierStep, step_table
 from .bad_pixels import SEVERAL, grown, saturated_pixels
 from .diffraction_vote import DiffractionVote, vote_on_diffraction
-from .fit_star import StarFit, fit_star
+from .fit_star import StarFit
 from .flags import DonutFlag
 from .freedom_fit import TelescopeFreedoms
 from .hole import warn_of_other_hole
@@ -40,14 +40,14 @@ from .image_model import (
 )
 from .inputs import ObservedStar, ObservedStars
 from .interrupted_fit import InterruptedFitError
-from .light import Instrument, StarLight
+from .light import Instrument
 from .likelihood import pulls
 from .model import DonutModel
-from .noise import AssumedElectron, PixelNoise, faint_level, measured_noise, smoothed
+from .noise_fit import fit_with_noise, light_level
 from .result import DonutFit
 from .rim_table import moved_rims, rim_table
 from .shared_rims import contradicted
-from .stamps import Pixels, central_slices
+from .stamps import central_slices
 from .star_errors import ErrorParts
 from .star_fitter import StarSolution
 from .step_search import fit_steps
@@ -59,10 +59,6 @@ _MOST = 0.5
 _POOR = 1.2
 #: Standard deviations of the noise's own chi-square that a poor fit has beyond that.
 _BY_CHANCE = 5.0
-#: Ratio of the noise that a fit leaves to that which it assumed, up to which its search holds.
-_NOISE_AGREES = 2.0
-#: Most fits of a star whose noise is measured.
-_NOISE_FITS = 3
 #: Most fits of a star with steps between amplifiers, and change of their amplitudes over their standard deviations
 #: below which these hold.
 _STEP_FITS = 4
@@ -298,7 +294,7 @@ def _fit_alone(
     donut = instrument.is_donut(light)
     wavefront = not joint or donut
     fitted_once = partial(
-        _fit_with_noise,
+        fit_with_noise,
         instrument,
         light,
         used=~masked,
@@ -340,64 +336,17 @@ def _fit_with_steps(fit: Callable[..., StarFit], star: ObservedStar, begun: Star
     return fitted
 
 
-def _fit_with_noise(
-    instrument: Instrument,
-    light: StarLight,
-    star: ObservedStar,
-    begun: StarFit | None,
-    *,
-    used: np.ndarray,
-    strength: float,
-    wavefront: bool,
-    preliminary: bool,
-) -> StarFit:
-    """Fit the used pixels of one star with its known noise, or with noise and sky level that are measured."""
-    fit = partial(fit_star, instrument, light, strength=strength, wavefront=wavefront, preliminary=preliminary)
-    image = np.where(used, star.image, 0.0)
-    if star.known_noise:
-        return fit(Pixels(image, star.variance, used), begun=begun)
-    smooth = smoothed(image, used)
-    level = faint_level(smooth, used)
-    image = np.where(used, star.image - level, 0.0)
-    if begun is None or begun.usable is None:
-        noise = measured_noise(image, smooth - level, used, level)
-    else:
-        noise = _noise_of(begun.usable, begun.unit)
-    brightest = float((smooth - level)[used].max(initial=0.0))
-    for _ in range(_NOISE_FITS):
-        unit = noise.photon
-        pixels = Pixels(image / unit, np.full(image.shape, noise.sky / unit**2), used)
-        fitted = fit(pixels, electron=AssumedElectron(unit, level / unit), begun=begun)
-        if fitted.usable is None:
-            break
-        assumed, noise, begun = noise, _noise_of(fitted.usable, unit * fitted.unit), None
-        if 1.0 / _NOISE_AGREES < noise.variance(brightest) / assumed.variance(brightest) < _NOISE_AGREES:
-            break
-    return replace(fitted, unit=unit * fitted.unit, level=level)
-
-
-def _noise_of(solution: StarSolution, unit: float) -> PixelNoise:
-    """Return the noise that a solution in a unit left [units of the image]."""
-    return PixelNoise(float(solution.full.variance.mean()) * unit**2, unit)
-
-
 def _steps_of(fitted: StarFit | None) -> tuple[AmplifierStep, ...]:
     """Return the steps between amplifiers on the stamp of a fit."""
     usable = None if fitted is None else fitted.usable
     return () if usable is None or usable.steps is None else usable.steps.steps
 
 
-def _light_level(fitted: StarFit) -> float:
-    """Return the level of a stamp above which there is light of the star by its fit [units of the image]."""
-    usable = fitted.usable
-    return fitted.level + (0.0 if usable is None else fitted.unit * float(usable.solution.stars[0][BACKGROUND]))
-
-
 def _without_steps(star: ObservedStar, steps: Sequence[AmplifierStep], fitted: StarFit | None) -> ObservedStar:
     """Return a star without steps between amplifiers, by a fit that has its level."""
     for step in steps:
         assert fitted is not None
-        star = replace(star, image=step.taken_off(star.image, _light_level(fitted)))
+        star = replace(star, image=step.taken_off(star.image, light_level(fitted)))
     return star
 
 
@@ -435,8 +384,10 @@ def _result(instrument: Instrument, observed: ObservedStars, fits: _Fitted) -> D
             covariances[i] = getattr(star.errors, cause)
         model[i][middle], used[i][middle] = units[i] * star.model + levels[i], star.pixels.used
         for step in reversed(_steps_of(fits.stars[i])):
-            model[i][:] = step.put_on(model[i], _light_level(fits.stars[i]))
-        noise[i] = units[i] ** 2 * np.median(star.pixels.variance)
+            model[i][:] = step.put_on(model[i], light_level(fits.stars[i]))
+        # That of the level of the background, whose light has it in a fit.
+        measured = units[i] ** 2 * (np.median(star.pixels.variance) + star.unknowns[BACKGROUND])
+        noise[i] = np.median(observed.star(i).variance[middle]) if observed.known_noise else measured
         chi2[i] = (pulls(star.pixels, star.model)[star.pixels.used] ** 2).sum()
         n_pixels[i] = star.pixels.used.sum()
     slopes = np.full((2, count, 2), np.nan)

@@ -137,19 +137,18 @@ def fit_star(
     donut = instrument.is_donut(light)
     fitter = StarFitter(instrument, light, without_bad_pixels(pixels) if donut else pixels, strength, wavefront)
     if begun is not None and begun.usable is not None and _holds(begun, light):
-        return _continued(fitter, pixels, begun, begun.usable, electron)
+        return _continued(fitter, pixels, begun, begun.usable, electron, preliminary)
     fitter, start = _started(fitter)
     pixels = pixels.central(fitter.clean.image.shape)
     flags = DonutFlag.OK
     if not start.match.significance >= _FOUND:
-        # On a stamp that is much smaller than its donut nothing stands out.
-        small = pixels.image.size < (1.0 - _LOST) * _area(instrument, light)
-        flags |= DonutFlag.MOSTLY_LOST if donut and small else DonutFlag.NO_DONUT
+        flags |= DonutFlag.NO_DONUT
     n_term = len(instrument.terms.requested) if wavefront else 0
     if start.match.flux < len(NUISANCES) + n_term or (not flags and is_faint(start, n_term)):
         flags |= DonutFlag.TOO_FEW_PHOTONS
     if flags:
-        return StarFit(flags)
+        # On a stamp that is much smaller than its donut nothing stands out.
+        return StarFit(DonutFlag.MOSTLY_LOST if donut and fitter.lost_at_best(start.stamp) > _LOST else flags)
     search = _search(fitter, start)
     if donut and search.misfit > _POOR:
         search = _masked_search(search.fitter, search)
@@ -175,11 +174,6 @@ def fit_star(
     return _finished(fitter, pixels, best, sides, electron, search.rivals, preliminary)
 
 
-def _area(instrument: Instrument, light: StarLight) -> float:
-    """Return the area of the ring of a donut [pixels]."""
-    return 0.25 * np.pi * (light.diameter / instrument.pixel) ** 2 * (1.0 - instrument.telescope.pupil_obscuration**2)
-
-
 def _holds(begun: StarFit, light: StarLight) -> bool:
     """Return whether the search of a fit holds for one of other light that begins from it."""
     if not begun.searched:
@@ -189,7 +183,12 @@ def _holds(begun: StarFit, light: StarLight) -> bool:
 
 
 def _continued(
-    fitter: StarFitter, pixels: Pixels, begun: StarFit, best: StarSolution, electron: AssumedElectron | None
+    fitter: StarFitter,
+    pixels: Pixels,
+    begun: StarFit,
+    best: StarSolution,
+    electron: AssumedElectron | None,
+    preliminary: bool,
 ) -> StarFit:
     """Return the outcome of a fit from the best model of one that has begun, with its rims if none are those of all."""
     shape, solution, own_rims = best.full.used.shape, best.solution, best.light.free_rims
@@ -208,7 +207,7 @@ def _continued(
         RimFit(fitter.with_free_rims(rival.rims).light, best.stamp, begin(rival.wave)) for rival in own_rivals
     )
     best_begun, fitter = begin(solution.shared[:known]), fitter.beginning_from(best)
-    return _finished(fitter, pixels.central(shape), best_begun, begun.sides, electron, rivals)
+    return _finished(fitter, pixels.central(shape), best_begun, begun.sides, electron, rivals, preliminary)
 
 
 class CoarseFit(NamedTuple):

@@ -73,7 +73,8 @@ def warn_of_other_hole(instrument: Instrument, solutions: dict[int, StarSolution
     if (np.abs(differences) > _DIFFERENCE).all() and np.ptp(np.sign(differences)) == 0.0:
         text = (
             f"{telescope.name}: donuts show an obscuration of {np.median(shown):.2f}, its light has {lit:.2f}: "
-            "expected the annulus of the mirror, and pupil.obscuration, as they are; Zernikes are wrong"
+            "expected the annulus of the mirror, and pupil.obscuration, as they are; Zernikes are wrong unless the "
+            "telescope has the spherical aberration (Z11, Z22) that is fitted"
         )
         warnings.warn(text, PrescriptionWarning, stacklevel=4)
 

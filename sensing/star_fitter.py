@@ -20,7 +20,7 @@ from .moving_rims import FreeRims
 from .noise import AssumedElectron, measured_noise
 from .rim_search import RimFit, RimSolver, finished
 from .solve import FINE, STEPS, Group, Solution, solve
-from .stamps import Match, Pixels, match_template, measured_variance
+from .stamps import Match, Pixels, match_template, measured_variance, moved
 
 #: Pixels across a donut in the coarse fit, about.
 _COARSE_DIAMETER = 30.0
@@ -159,6 +159,11 @@ class StarFitter:
         return ny, nx
 
     @property
+    def fits_wavefront(self) -> bool:
+        """Whether the wavefront is unknown."""
+        return self._wavefront
+
+    @property
     def light(self) -> StarLight:
         """Light of the star."""
         return self._light
@@ -225,10 +230,10 @@ class StarFitter:
                 return rays
         return self._rays.setdefault(across, self.instrument.rays(light, across))
 
-    def without_wavefront(self) -> StarFitter:
-        """Return the same without unknowns of the wavefront, which is zero."""
+    def of_first_terms(self, count: int) -> StarFitter:
+        """Return the same with so many of the first unknowns of the wavefront; the others are zero."""
         fitter = copy(self)
-        fitter._map = self._map[:, :, :0]
+        fitter._map = self._map[:, :, :count]
         return fitter
 
     def central(self, shape: tuple[int, int]) -> StarFitter:
@@ -327,7 +332,11 @@ class StarFitter:
         level = model_image(star.full, np.where(np.arange(len(unknowns)) == FLUX, 0.0, unknowns), wave)
         residual, light = star.full.image - star.model, star.model - level
         noise = measured_noise(residual, light, star.full.used, electron.sky_level, correlated=True, unit=electron.size)
-        unit, sky = noise.photon, noise.sky / noise.photon**2
+        unit = noise.photon
+        unknowns = unknowns.copy()
+        unknowns[[FLUX, BACKGROUND, SLOPE_X, SLOPE_Y]] /= unit
+        # The noise is that at the level of the background, and an image without light has less, or more.
+        sky = max(noise.sky / unit**2 - float(unknowns[BACKGROUND]), 0.0)
 
         def rescaled(stamp: Stamp) -> Stamp:
             return replace(
@@ -336,8 +345,6 @@ class StarFitter:
                 variance=np.full(stamp.image.shape, sky * stamp.grid.scale**2),
             )
 
-        unknowns = unknowns.copy()
-        unknowns[[FLUX, BACKGROUND, SLOPE_X, SLOPE_Y]] /= unit
         stamp, full = rescaled(star.stamp), rescaled(star.full)
         best = self.solve(stamp, unknowns, star.solution.shared)
         model = model_image(full, best.stars[0], best.waves[0])
@@ -419,6 +426,12 @@ class StarFitter:
         template = model_image(stamp, unknowns, np.zeros(len(self.precision)))
         measured = grid.scale**2 * measured_variance(self.clean)
         match = match_template(stamp.image, stamp.used, stamp.variance, template, measured)
+        if pixels.side == 1 and self.donut:
+            # Light of a small donut is as steep as noise, and on a tight stamp there is nothing else.
+            light = match.flux * moved(template, int(match.y), int(match.x))
+            beside = replace(self.clean, image=self.clean.image - light)
+            measured = min(measured, measured_variance(beside))
+            match = match_template(stamp.image, stamp.used, stamp.variance, template, measured)
         unknowns[FLUX] = max(match.flux, 1.0)
         unknowns[[X, Y]] += grid.scale * np.array([match.x, match.y])
         level, *slopes = match.plane / grid.scale**2
@@ -447,6 +460,13 @@ class StarFitter:
         column, row = np.where(outside[:, None], 0, place).astype(np.int64).T
         lost, cut = (outside | pixels[row, column] for pixels in (~used, regions))
         return LostLight(float(weights @ lost), float(weights @ cut))
+
+    def lost_at_best(self, stamp: Stamp) -> float:
+        """Return the fraction of the light of a star without aberrations beside the stamp when it is in the middle."""
+        wave = np.zeros(len(self.precision))
+        landing, weights = stamp.rays.landing(wave), stamp.rays.weights(wave)
+        half = 0.5 * self.instrument.pixel * np.array(self.clean.used.shape[::-1])
+        return float(weights @ (np.abs(landing - weights @ landing) > half).any(axis=1))
 
     def solve(
         self,

@@ -19,6 +19,8 @@ _LAST_TERM = 28
 # least sum on: of LSST's mirrors, bent by 10 nm of each of their first twenty modes (donuts of danish 1.3.0's tests).
 _FALL = 0.68
 _LEAST = 6
+#: Rms of a term of which telescopes have much [m].
+_MUCH = 100e-9
 # Terms up to the eleventh radial degree: what the mean wavefront of the air has beyond is lost in the seeing.
 _AIR_TERMS = 78
 
@@ -80,6 +82,12 @@ class WavefrontTerms:
     def every(self) -> np.ndarray:
         """Noll indices of all terms, shape [n + m]."""
         return np.concatenate([self.requested, self.further])
+
+    @property
+    def first_low(self) -> int:
+        """Number of the first terms up to Z22 that telescopes have much of, before any other."""
+        low = (self.every <= _LOW_TERMS) & (self.precision < _MUCH**-2.0)
+        return len(low) if low.all() else int(np.argmin(low))
 
     def spreads_beyond(self, noll: np.ndarray) -> np.ndarray:
         """Return the rms of terms that are not fitted [m].

@@ -111,8 +111,8 @@ def test_a_refinement_that_does_not_converge_loses_no_donut(focused, pairs, monk
         fitted = one_star(*given, begun=begun, **options)
         return fitted if begun is None else replace(fitted, flags=fitted.flags | pachon.sensing.DonutFlag.NOT_CONVERGED)
 
-    one_star = pachon.sensing.fit.fit_star
-    monkeypatch.setattr(pachon.sensing.fit, "fit_star", fit_star)
+    one_star = pachon.sensing.noise_fit.fit_star
+    monkeypatch.setattr(pachon.sensing.noise_fit, "fit_star", fit_star)
     model = replace(of_sides(1, 1), diffraction=False)
     fit = pachon.fit_donuts(focused, pairs[:2], FIELDS, WAVELENGTH, model=model, fit=Refined(), **OPTIONS)
     assert fit.usable.all()
