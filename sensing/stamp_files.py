@@ -275,7 +275,7 @@ def _with_planes(
             raise ProductError(f"planes of {kind}: {counts}: expected one for each image, as large", file=file)
     out = []
     for k, (header, data) in enumerate(images):
-        own_mask = _bad_pixels(*planes["mask"][k], file) if planes["mask"] else np.zeros(data.shape, dtype=bool)
+        own_mask = _bad_pixels(*planes["mask"][k], mask or path) if planes["mask"] else np.zeros(data.shape, bool)
         own_variance = None
         if planes["variance"]:
             own_variance = np.asarray(planes["variance"][k][1], dtype=np.float64)

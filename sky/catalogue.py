@@ -178,11 +178,11 @@ def _from_catalogue(
     columns: dict[str, Column | np.ndarray], pointing: Any, convention: EllipticityConvention | None = None
 ) -> Galaxies:
     """Return galaxies of one component from the columns of a catalogue."""
-    celestial = None
+    celestial: tuple[np.ndarray, np.ndarray] | None = None
     if "xi" in columns or "eta" in columns:
         xi, eta = (_column_values(columns, name, u.rad) for name in ("xi", "eta"))
     elif "ra" in columns or "dec" in columns:
-        celestial = [_column_values(columns, name, u.deg) for name in ("ra", "dec")]
+        celestial = _column_values(columns, "ra", u.deg), _column_values(columns, "dec", u.deg)
         xi, eta = tangent_plane(*celestial, pointing)
     else:
         column_names = ", ".join(columns) or "none"
