@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from ..design.metrics.field_zernikes import FittedPupil
 from ..sky.visit_list.seeing import KOLMOGOROV_WIDTH, WAVELENGTH
 from .bench import Bench, height_factors
 from .state import DeskState
-from .views import RINGS, SITE
+from .views import JMAX, RINGS, SITE
 
 
-def python_text(bench: Bench, state: DeskState) -> str:
-    """Return a program that makes the telescope and the CCDs of a state, and prints its numbers."""
+def python_text(bench: Bench, state: DeskState, pupil: FittedPupil = "full") -> str:
+    """Return a program that makes the telescope and the CCDs of a state, and prints its numbers.
+
+    Zernikes are fitted over the whole annulus, or over the lit part of the pupil.
+    """
     optics = {name: value for name, value in state.total_optics.items() if value}
     lines = ["import numpy as np", "", "import pachon", "from pachon import models", ""]
     lines.append(f"nominal = pachon.load_telescope({state.model!r})")
@@ -39,7 +43,7 @@ def python_text(bench: Bench, state: DeskState) -> str:
         f"spots = pachon.spots(telescope, star, wavelength, {rings})",
         f"print('rms radius of the spot [{unit}]:', spots.rms_radius * 1e6)",
         "request = pachon.Request.of(telescope, star, wavelength).on(focal_plane)",
-        "zernikes = pachon.wavefront_zernikes(request, jmax=22)",
+        f"zernikes = pachon.wavefront_zernikes(request, jmax={JMAX}, pupil={pupil!r})",
         "print('Zernikes from Z4 [nm]:', zernikes.coefficients[0, 3:] * 1e9)",
     ]
     return "\n".join(lines) + "\n"
