@@ -58,7 +58,7 @@ def main() -> None:
             )
             fit = pachon.fit_donuts(telescope, donuts.images, FIELDS, WAVELENGTH, sky_variance=donuts.sky_variance)
             found[time] += [1e9 * float(np.linalg.norm(z)) for z in fit.zernikes if np.isfinite(z).all()]
-            noise = 1e9 * float(np.sqrt(np.trace(fit.covariance[0])))
+            noise = 1e9 * float(np.sqrt(np.trace(fit.error_parts.photons[0])))
             law = mean_wavefront_covariance(replace(air, exposure=time), FIELDS[:1], NOLL, *pupil)[0, :, 0]
             expected[time].append(1e9 * float(np.sqrt(np.trace(law))))
         longest.release()
