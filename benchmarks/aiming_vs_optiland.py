@@ -7,8 +7,8 @@ thread and on two, and optiland ("robust" aiming, at its own tolerance of 1e-6 a
 Processor time first, which other work on the machine hardly changes, then the clock. Ratios are of the best times.
 """
 
+import argparse
 import os
-import sys
 import tempfile
 import time
 import warnings
@@ -22,7 +22,9 @@ from optiland.samples import objectives
 
 import pachon
 
-RAYS = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000
+PARSER = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+PARSER.add_argument("rays", type=int, nargs="?", default=1_000_000, help="rays through each system")
+RAYS = PARSER.parse_args().rays
 ROUNDS = 3
 SYSTEMS = ("CookeTriplet", "DoubleGauss", "WideAngle100FOV")
 

@@ -16,6 +16,7 @@ import argparse
 import os
 import pickle
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -95,6 +96,8 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="danish's tests, with data/AuxTelTestDonuts.pkl")
     parser.add_argument("--no-danish", action="store_true")
     options = parser.parse_args()
+    peer_text = "" if options.no_danish else f", danish {version('danish')}"
+    print(f"pachon {pachon.__version__}{peer_text}")
     images = read(options.folder)
     fit_pachon(images[:, 60:-60, 60:-60], 4)  # compiles
     for last in (11, 22):

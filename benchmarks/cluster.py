@@ -4,6 +4,7 @@ Two workers of this machine do jobs that cost nothing, with what a CCD of the pa
 for real. What is left of a night is arithmetic, printed with the rest.
 """
 
+import argparse
 import pickle
 import platform
 import sys
@@ -21,7 +22,10 @@ from pachon.core.long_work import Job, JobComputation, JobResult
 from pachon.pipeline.ccd_worker import compute_ccd
 from pachon.pipeline.config import with_options
 
-JOBS = int(sys.argv[1]) if len(sys.argv) > 1 else 400
+PARSER = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+PARSER.add_argument("jobs", type=int, nargs="?", default=400, help="empty jobs of each kind")
+ARGUMENTS = PARSER.parse_args()
+JOBS = ARGUMENTS.jobs
 #: Size of the product of a CCD with 800 noise-free and 40 observed stars [byte].
 PRODUCT = 3_900_000
 

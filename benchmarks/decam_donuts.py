@@ -18,6 +18,7 @@ import argparse
 import os
 import time
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -186,6 +187,8 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--no-danish", action="store_true")
     options = parser.parse_args()
+    peer_text = "" if options.no_danish else f", danish {version('danish')}"
+    print(f"pachon {pachon.__version__}{peer_text}")
     work, ccds = read(options.folder)
     stamps = [np.asarray(image, dtype=np.float64) for image in work.inputs.images]
     fit_pachon(work, 4)  # compiles

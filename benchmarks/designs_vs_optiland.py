@@ -6,11 +6,11 @@ The systems are read from optiland's own files. Both aim their rays at the stop 
 those of sample_systems.py.
 """
 
+import argparse
 import importlib
 import inspect
 import math
 import os
-import sys
 import tempfile
 import warnings
 from pathlib import Path
@@ -278,9 +278,12 @@ def optiland_times(name):
 
 
 def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", default=OPTILAND, help="sample systems of optiland")
+    names = parser.parse_args().names
     warnings.simplefilter("ignore")
     show_head("optiland")
-    for name in sys.argv[1:] or OPTILAND:
+    for name in names:
         show(name, against_optiland(name), optiland_times(name))
 
 

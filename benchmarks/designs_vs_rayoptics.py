@@ -6,9 +6,9 @@ Files are those that ray-optics installs. It traces the rays that pachon aims at
 sample_systems.py; ray-optics has no MTF.
 """
 
+import argparse
 import math
 import os
-import sys
 import warnings
 from pathlib import Path
 
@@ -192,9 +192,12 @@ def rayoptics_times(path):
 
 
 def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", default=RAYOPTICS, help="files that ray-optics installs")
+    names = parser.parse_args().names
     warnings.simplefilter("ignore")
     show_head("ray-optics")
-    for name in sys.argv[1:] or RAYOPTICS:
+    for name in names:
         path = rayoptics_folder() / name
         show(path.stem, against_rayoptics(path), rayoptics_times(path))
 

@@ -9,8 +9,8 @@ it. Beside the clock stands the processor time of all threads, which other work 
 of the resident memory over the moves is printed too.
 """
 
+import argparse
 import resource
-import sys
 import time
 
 import numpy as np
@@ -19,7 +19,10 @@ from pachon.desk.bench import Bench
 from pachon.desk.session import Session
 from pachon.desk.views import Scene, whiskers_view
 
-MOVES = int(sys.argv[1]) if len(sys.argv) > 1 else 40
+PARSER = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+PARSER.add_argument("moves", type=int, nargs="?", default=40, help="moves of the slider")
+ARGUMENTS = PARSER.parse_args()
+MOVES = ARGUMENTS.moves
 
 
 def timed(function) -> tuple[float, float]:

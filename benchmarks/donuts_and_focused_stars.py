@@ -11,7 +11,7 @@ picture has the posterior over the prior standard deviation of the combinations.
 
 from __future__ import annotations
 
-import sys
+import argparse
 import time
 from pathlib import Path
 
@@ -23,8 +23,12 @@ from pachon.core.plotting import BLUE, ORANGE, picture_bytes, styled
 from pachon.studies import AlignConfig
 from pachon.studies.alignment.scene import AlignmentScene
 
-STARS = int(sys.argv[1]) if len(sys.argv) > 1 else 40
-PICTURE = sys.argv[2] if len(sys.argv) > 2 else None
+PARSER = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+PARSER.add_argument("stars", type=int, nargs="?", default=40, help="stars in focus")
+PARSER.add_argument("picture", nargs="?", default=None, help="picture to write")
+ARGUMENTS = PARSER.parse_args()
+STARS = ARGUMENTS.stars
+PICTURE = ARGUMENTS.picture
 DEFOCUS, ELECTRONS, FOCUSED, SKY, READ_NOISE, DIFFUSION = 1.5e-3, 5e6, 2e5, 300.0, 8.8, 4e-6
 #: Rms of the degrees of freedom, and standard deviation of their prior [tolerances].
 SIZE, PRIOR = 1.0, 2.0

@@ -10,7 +10,7 @@ error of the photons is turbulence. Root of the sum of squares over Z4 to Z22, b
 
 from __future__ import annotations
 
-import sys
+import argparse
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +18,10 @@ import numpy as np
 import pachon
 from pachon.wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
 
-EPOCHS = int(sys.argv[1]) if len(sys.argv) > 1 else 5
+PARSER = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+PARSER.add_argument("epochs", type=int, nargs="?", default=5, help="exposures, of two donuts each")
+ARGUMENTS = PARSER.parse_args()
+EPOCHS = ARGUMENTS.epochs
 WAVELENGTH, NOLL = 620e-9, np.arange(4, 23)
 TIMES = (3.75, 7.5, 15.0, 30.0)
 FIELDS = np.deg2rad([(-1.19, -1.125), (1.125, -1.19)])
@@ -55,7 +58,7 @@ def main() -> None:
             )
             fit = pachon.fit_donuts(telescope, donuts.images, FIELDS, WAVELENGTH, sky_variance=donuts.sky_variance)
             found[time] += [1e9 * float(np.linalg.norm(z)) for z in fit.zernikes if np.isfinite(z).all()]
-            noise = 1e9 * float(np.sqrt(np.trace(fit.covariance[0])))
+            noise = 1e9 * float(np.sqrt(np.trace(fit.error_parts.photons[0])))
             law = mean_wavefront_covariance(replace(air, exposure=time), FIELDS[:1], NOLL, *pupil)[0, :, 0]
             expected[time].append(1e9 * float(np.sqrt(np.trace(law))))
         longest.release()

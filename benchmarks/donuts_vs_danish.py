@@ -6,12 +6,12 @@ Each donut is a perturbed LSST (r band, 620 nm): M2 and camera shifted and tilte
 the figure of the primary. Rays of random pupil points, each turned by the angle of a photon of a Kolmogorov profile of
 0.8 arcsec, are traced by batoid to a detector 1.5 mm behind or in front of the focus and counted in pixels of 10 um,
 with a sky of 300 electrons a pixel, read noise of 9 and a place within the pixel. Both fit Z4 to Z22 of what is beyond
-the unperturbed, defocused telescope, on the same stamps, in turns, each on one thread; times are processor time.
-Errors are the root of the sum of squares over Z4 to Z22 against batoid's Zernikes of the wavefront; for danish, whose
-pupil maps are those of transverse aberrations, against batoid's Zernikes of these if they are nearer. The limit is that
-of Cramer and Rao, from pachon's covariance. Fields are at random within 1.75 degrees, or all at --field. With --second
-each stamp has a second star through the same telescope, with a hundredth to half of the light, within 75 pixels along
-each axis. A donut of 5e6 photons takes some 20 s.
+the unperturbed, defocused telescope, on the same stamps, in turns, each on one thread; times are processor time. Errors
+are the root of the sum of squares over Z4 to Z22 against batoid's Zernikes of the wavefront; for danish, whose pupil
+maps are those of transverse aberrations, against batoid's Zernikes of these if they are nearer. The limit is that of
+Cramer and Rao, from the photons' part of pachon's covariance. Fields are at random within 1.75 degrees, or all at
+--field. With --second each stamp has a second star through the same telescope, with a hundredth to half of the light,
+within 75 pixels along each axis. A donut of 5e6 photons takes some 20 s.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def main() -> None:
         case = make_case(number, options)
         start = time.process_time()
         fit = fit_pachon(case)
-        row = [rss(fit.zernikes[0] - case.wavefront), rss(np.sqrt(np.diag(fit.covariance[0])))]
+        row = [rss(fit.zernikes[0] - case.wavefront), rss(np.sqrt(np.diag(fit.error_parts.photons[0])))]
         row.append(time.process_time() - start)
         line = f"{np.rad2deg(np.hypot(*case.field)):6.2f} {1e3 * case.height:4.1f} mm {rss(case.wavefront):6.0f} nm"
         line += f" {row[0]:7.1f} {row[1]:6.1f} {fit.chi2[0] / case.image.size:5.3f} {row[2]:6.2f}"
@@ -202,7 +202,7 @@ def main() -> None:
             row += [min(rss(found - truth) for truth in (case.wavefront, case.aberrations))]
             row += [time.process_time() - start]
             line += f"  {row[3]:7.1f} {row[4]:6.2f}"
-        print(f"{line}  {fit.flags[0]!s}", flush=True)
+        print(f"{line}  {fit.reasons[0]}", flush=True)
         table.append(row)
     columns = np.array(table).T
     print(f"\npachon: median {np.nanmedian(columns[0]):.1f}, worst {np.nanmax(columns[0]):.1f} nm", end="")

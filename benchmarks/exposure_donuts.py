@@ -11,8 +11,8 @@ chi-square of the errors a term, and processor time.
 
 from __future__ import annotations
 
+import argparse
 import pickle
-import sys
 import time
 from pathlib import Path
 
@@ -26,7 +26,9 @@ AIR = pachon.Air(69328.0, 293.15, 1067.0, formula="filippenko")
 
 
 def main() -> None:
-    folder = Path(sys.argv[1])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="folder of the pickles of danish")
+    folder = parser.parse_args().folder
     freedoms = pachon.load_degrees_of_freedom("lsst")
     telescope = pachon.load_telescope("lsst_v3.3_i").in_medium(AIR).perturbed("Camera", shift=(0.0, 0.0, 1.5e-3))
     fits = {

@@ -12,8 +12,8 @@ what the covariance of the fit expects, and processor time and memory.
 
 from __future__ import annotations
 
+import argparse
 import resource
-import sys
 import time
 from pathlib import Path
 
@@ -26,11 +26,18 @@ from pachon.pipeline.simulate.donuts import STAMP_SIZE
 from pachon.studies import AlignConfig
 from pachon.studies.alignment.scene import AlignmentScene
 
-COUNT = int(sys.argv[1]) if len(sys.argv) > 1 else 189
-SIDES = int(sys.argv[2]) if len(sys.argv) > 2 else 2
-PICTURE = sys.argv[3] if len(sys.argv) > 3 and sys.argv[3] != "-" else None
-ELECTRONS = float(sys.argv[4]) if len(sys.argv) > 4 else 5e6
-MOVED = sys.argv[5] if len(sys.argv) > 5 else "Camera"
+PARSER = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+PARSER.add_argument("ccds", type=int, nargs="?", default=189, help="CCDs, of a donut each")
+PARSER.add_argument("sides", type=int, nargs="?", default=2, help="sides of focus, 1 or 2")
+PARSER.add_argument("picture", nargs="?", default="-", help="picture to write; - for none")
+PARSER.add_argument("electrons", type=float, nargs="?", default=5e6, help="electrons of a star")
+PARSER.add_argument("moved", nargs="?", default="Camera", help="body that makes the defocus")
+ARGUMENTS = PARSER.parse_args()
+COUNT = ARGUMENTS.ccds
+SIDES = ARGUMENTS.sides
+PICTURE = ARGUMENTS.picture if ARGUMENTS.picture != "-" else None
+ELECTRONS = ARGUMENTS.electrons
+MOVED = ARGUMENTS.moved
 DEFOCUS, SKY, READ_NOISE, DIFFUSION = 1.5e-3, 300.0, 8.8, 4e-6
 
 

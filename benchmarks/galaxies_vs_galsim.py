@@ -6,6 +6,7 @@ Prints transforms of random galaxies per second on 48 x 48 pixels of 0.2 arcsec,
 the greatest difference of both, and the time to draw the galaxies of one CCD of the LSST to 29. Half a minute.
 """
 
+import argparse
 import os
 import platform
 import time
@@ -45,6 +46,7 @@ def of_galsim(galaxies):
 
 
 def main():
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     print(f"pachon {pachon.__version__}, GalSim {galsim.__version__}, Warp {wp.__version__}, NumPy {np.__version__},")
     print(f"{platform.machine()}, {os.cpu_count()} processors; galaxies to 27, components counted together")
     start = time.perf_counter()

@@ -10,12 +10,16 @@ number of threads; one thread is timed by processor time, which other work on th
 the clock. The first call, which compiles or loads the kernels, is timed apart.
 """
 
+import argparse
 import os
-import sys
 import time
 
-PHOTONS = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000
-THREADS = int(sys.argv[2]) if len(sys.argv) > 2 else 1
+PARSER = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+PARSER.add_argument("photons", type=int, nargs="?", default=1_000_000, help="photons of GalSim")
+PARSER.add_argument("threads", type=int, nargs="?", default=1, help="threads of each side")
+ARGUMENTS = PARSER.parse_args()
+PHOTONS = ARGUMENTS.photons
+THREADS = ARGUMENTS.threads
 # batoid reads it when it is imported.
 os.environ["OMP_NUM_THREADS"] = str(THREADS)
 

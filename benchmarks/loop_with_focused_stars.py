@@ -13,7 +13,7 @@ tolerances, and in the long run.
 
 from __future__ import annotations
 
-import sys
+import argparse
 
 import numpy as np
 
@@ -24,8 +24,12 @@ from pachon.studies.alignment.estimator import estimate_state
 from pachon.studies.alignment.scene import NOLL, AlignmentScene
 from pachon.wavefront.pupil_sampling import spiral_annulus
 
-STARS = int(sys.argv[1]) if len(sys.argv) > 1 else 40
-STATES = int(sys.argv[2]) if len(sys.argv) > 2 else 4
+PARSER = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+PARSER.add_argument("stars", type=int, nargs="?", default=40, help="stars in focus")
+PARSER.add_argument("states", type=int, nargs="?", default=4, help="states of the telescope")
+ARGUMENTS = PARSER.parse_args()
+STARS = ARGUMENTS.stars
+STATES = ARGUMENTS.states
 SNR, DONUT_ERROR = 300.0, 28.4e-9
 TURBULENCE, SCALES = np.array([5.0e-6, 7.1e-6, 1.6e-5]), np.deg2rad([3.0 / 60.0, 16.0 / 60.0])
 FREE_MEAN, STEP, VISITS = 0.02, 0.02, 60

@@ -10,6 +10,7 @@ with this one. Ratios are of the best rounds of each; on a busy machine the rati
 is more reliable. The first compilation is shown apart.
 """
 
+import argparse
 import os
 import subprocess
 import sys
@@ -20,8 +21,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import batoid
 import numpy as np
 
-FIELDS = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
-MODEL = sys.argv[2] if len(sys.argv) > 2 else "lsst_v3.3_r"
+PARSER = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+PARSER.add_argument("fields", type=int, nargs="?", default=1000, help="field points")
+PARSER.add_argument("model", nargs="?", default="lsst_v3.3_r", help="lsst_v3.3_r or rubin_v3.14_r")
+PARSER.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+ARGUMENTS = PARSER.parse_args()
+FIELDS = ARGUMENTS.fields
+MODEL = ARGUMENTS.model
 PEERS = {"lsst_v3.3_r": "LSST_r.yaml", "rubin_v3.14_r": "Rubin_v3.14_r.yaml"}
 WAVELENGTH, GRID, ROUNDS = 620e-9, 53, 15
 PEER_FIELDS = 40
@@ -121,4 +127,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    serve_rounds() if "--serve" in sys.argv else main()
+    serve_rounds() if ARGUMENTS.serve else main()

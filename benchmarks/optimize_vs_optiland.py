@@ -9,8 +9,8 @@ with rays that fill the stop ("spots --aiming real"). Optiland takes part with i
 "robust" aiming where asked (--aimed), which fills the stop as pachon does.
 """
 
+import argparse
 import os
-import sys
 import tempfile
 import time
 import warnings
@@ -33,7 +33,11 @@ RINGS = 4
 TOLERANCE = 1e-6
 #: Largest number of evaluations of the merit, those for derivatives not counted.
 STEPS = 60
-AIMED = "--aimed" in sys.argv
+PARSER = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+PARSER.add_argument("names", nargs="*", default=list(SYSTEMS), help="sample systems of optiland")
+PARSER.add_argument("--aimed", action="store_true", help="aim optiland's rays at the stop, too")
+ARGUMENTS = PARSER.parse_args()
+AIMED = ARGUMENTS.aimed
 
 
 def telescope_of(optic):
@@ -109,9 +113,8 @@ def compare(name):
 
 def main() -> None:
     warnings.simplefilter("ignore")
-    names = [name for name in sys.argv[1:] if not name.startswith("-")] or list(SYSTEMS)
     print(f"pachon {pachon.__version__}, optiland {version('optiland')}, numpy {np.__version__}, one thread")
-    ratios = np.array([compare(name) for name in names])
+    ratios = np.array([compare(name) for name in ARGUMENTS.names])
     seconds, spots = np.median(ratios, axis=0)
     print(f"medians of optiland over pachon: processor time {seconds:.1f}, spots {spots:.2f}")
 

@@ -7,7 +7,7 @@ same rays take turns in one process, about as long each and under the same load;
 column of the matrix is compared with central differences at the end.
 """
 
-import sys
+import argparse
 import time
 from dataclasses import replace
 
@@ -20,8 +20,12 @@ from pachon.models import annular_zernikes
 from pachon.models.parameters.parameters import apply, with_shape_terms
 from pachon.raytrace.rays import field_direction, parallel_rays
 
-THREADS = int(sys.argv[1]) if len(sys.argv) > 1 else 1
-RINGS = int(sys.argv[2]) if len(sys.argv) > 2 else 14
+PARSER = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+PARSER.add_argument("threads", type=int, nargs="?", default=1, help="threads of both sides")
+PARSER.add_argument("rings", type=int, nargs="?", default=14, help="rays along the radius of the pupil")
+ARGUMENTS = PARSER.parse_args()
+THREADS = ARGUMENTS.threads
+RINGS = ARGUMENTS.rings
 ROUNDS = 9
 MOTIONS = [f"{body}.{motion}" for body in ("M2", "Camera") for motion in ("dx", "dy", "dz", "rx", "ry")]
 PARAMETERS = [*MOTIONS, "M1.Z4-23", "M2.Z4-23"]

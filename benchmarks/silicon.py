@@ -7,8 +7,8 @@ without silicon, in focus at its surface and refocused, and the processor time o
 without it. Some ten minutes; `python benchmarks/silicon.py times` prints the last alone.
 """
 
+import argparse
 import platform
-import sys
 import time
 
 import numpy as np
@@ -141,8 +141,11 @@ def opd_times(band, telescope):
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("only", nargs="?", choices=["times"], help="print the processor time alone")
+    only = parser.parse_args().only
     print(f"pachon {pachon.__version__}, Python {platform.python_version()}, {platform.machine()}\n")
-    if sys.argv[1:] != ["times"]:
+    if only is None:
         absorption()
         colours()
     times()

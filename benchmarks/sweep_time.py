@@ -6,8 +6,8 @@ One and two processes take turns over the same points of the bundled study (189 
 same load of the machine. Overhead is wall time in which no worker computes. The full study has 1000 points.
 """
 
+import argparse
 import resource
-import sys
 import tempfile
 import time
 from dataclasses import replace
@@ -23,7 +23,10 @@ from pachon.studies.sweep.point import PointMeasurement
 from pachon.studies.sweep.store import SweepStore, create_store
 from pachon.studies.sweep.sweep import numbered_points
 
-POINTS = int(sys.argv[1]) if len(sys.argv) > 1 else 40
+PARSER = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+PARSER.add_argument("points", type=int, nargs="?", default=40, help="points of the sweep")
+ARGUMENTS = PARSER.parse_args()
+POINTS = ARGUMENTS.points
 EXAMPLE = Path(__file__).parents[1] / "studies" / "sweep" / "examples" / "table1.yaml"
 ROUNDS = 2
 

@@ -10,8 +10,8 @@ one take turns by the clock. The first compilation is timed apart. Ratios are
 of the best times: other work can only add to a time.
 """
 
+import argparse
 import os
-import sys
 import time
 
 os.environ["OMP_NUM_THREADS"] = "1"
@@ -22,7 +22,10 @@ import numpy as np
 import pachon
 from pachon.models import GridSag
 
-RAYS = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000
+PARSER = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+PARSER.add_argument("rays", type=int, nargs="?", default=1_000_000, help="rays through each telescope")
+ARGUMENTS = PARSER.parse_args()
+RAYS = ARGUMENTS.rays
 ROUNDS = 7
 FIELD, WAVELENGTH = (0.01, 0.02), 620e-9
 

@@ -85,9 +85,18 @@ def validate_command(
     - `pachon validate my_telescope.yaml run.yaml sweep.yaml`
     - `pachon validate lens.zmx --json`
     """
-    from ..studies.validation import validate_file
+    from ..core.errors import ConfigError
+    from ..studies.validation import Validation, validate_file
 
-    reports = [validate_file(path) for path in files]
+    reports = []
+    for path in files:
+        try:
+            reports.append(validate_file(path))
+        except ConfigError as error:
+            if len(files) == 1:
+                raise
+            # A file of no known kind does not hide the problems of the others.
+            reports.append(Validation(str(path), "unknown", (error,)))
     if as_json:
         print_json([report.summary() for report in reports])
     for report in reports if not as_json else []:

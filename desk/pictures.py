@@ -255,6 +255,7 @@ class ZernikePicture(Picture):
         """Draw coefficients."""
         compared = np.full(len(view.noll), np.nan) if reference is None else reference.zernikes_nm
         self.source.data = {"j": view.noll, "c": view.zernikes_nm, "a": compared}
+        self.figure.title.text = "Zernikes at the star" + " (lit part of the pupil)" * (view.pupil == "lit")
         self.figure.legend.items[1].visible = reference is not None
 
 

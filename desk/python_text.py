@@ -5,7 +5,7 @@ from __future__ import annotations
 from ..sky.visit_list.seeing import KOLMOGOROV_WIDTH, WAVELENGTH
 from .bench import Bench, height_factors
 from .state import DeskState
-from .views import RINGS, SITE
+from .views import JMAX, RINGS, SITE
 
 
 def python_text(bench: Bench, state: DeskState) -> str:
@@ -39,7 +39,7 @@ def python_text(bench: Bench, state: DeskState) -> str:
         f"spots = pachon.spots(telescope, star, wavelength, {rings})",
         f"print('rms radius of the spot [{unit}]:', spots.rms_radius * 1e6)",
         "request = pachon.Request.of(telescope, star, wavelength).on(focal_plane)",
-        "zernikes = pachon.wavefront_zernikes(request, jmax=22)",
+        f"zernikes = pachon.wavefront_zernikes(request, jmax={JMAX})",
         "print('Zernikes from Z4 [nm]:', zernikes.coefficients[0, 3:] * 1e9)",
     ]
     return "\n".join(lines) + "\n"

@@ -85,13 +85,14 @@ class Session(PageSession):
         self.bench = bench
         self.history = History(bench.check(state or bench.start))
         self._last_scene = Scene.of(bench, self.history.state)
+        self._drawn: DeskState | None = None
         self.views: dict[type, Any] = {}
         self.compared: dict[type, Any] = {}
         self.redraws = 0
         self._waiting = self._syncing = False
         self._changed = 0.0
         self._changed_geometry = self._changed_heights = True
-        self._sliders: dict[str, tuple[Slider, Spinner]] = {}
+        self._sliders: dict[str, tuple[Slider, Spinner, float, float]] = {}
         self._groups: dict[str, Any] = {}
         self._lifted = next(iter(self.bench.lifted_names), "")
         self._make_pictures()
@@ -199,7 +200,7 @@ class Session(PageSession):
         shown = {"sizing_mode": "stretch_width", "min_width": 120, "format": format_text, "margin": (2, 5, 0, 5)}
         slider = Slider(title=label, start=low, end=high, step=control.step, value=value, **shown)
         number = Spinner(title="", value=value, step=control.step, width=88, margin=(14, 5, 0, 5), name=control.key)
-        self._sliders[control.key] = slider, number
+        self._sliders[control.key] = slider, number, low, high
         slider.on_change("value", lambda attribute, old, new: self.set_value(control.key, new))
         number.on_change("value", lambda attribute, old, new: self.set_value(control.key, new, drag=False))
         return row(slider, number, sizing_mode="stretch_width")
@@ -219,13 +220,14 @@ class Session(PageSession):
     def _key(self, key: str) -> str:
         return f"lifts.{self._lifted}" if key == "lifts" else key
 
-    def _sync(self) -> None:
-        """Set all widgets to the numbers of the state."""
+    def _sync(self, *, fit: bool = False) -> None:
+        """Set all widgets to the numbers of the state; ranges grow to hold them, and shrink again where they fit."""
         self._syncing = True
         try:
-            for key, (slider, number) in self._sliders.items():
+            for key, (slider, number, low, high) in self._sliders.items():
                 value = self.history.state.value(self._key(key))
-                slider.update(start=min(slider.start, value), end=max(slider.end, value))
+                start, end = (low, high) if fit else (slider.start, slider.end)
+                slider.update(start=min(start, value), end=max(end, value))
                 for widget in (slider, number):
                     if widget.value != value:
                         widget.value = value
@@ -249,6 +251,8 @@ class Session(PageSession):
             self._sync()
             return
         self.change(state, key)
+        if not drag:
+            self.history.settle()
 
     def change(self, state: DeskState, control: str = "") -> None:
         """Go to a state and draw it; one that is impossible is one line, and the last good one stays."""
@@ -262,7 +266,7 @@ class Session(PageSession):
             self.history.push(state, control)
             self._last_scene = scene
             self._follow(before)
-        self._sync()
+        self._sync(fit=not control)
 
     def _follow(self, before: DeskState) -> None:
         state = self.history.state
@@ -307,9 +311,9 @@ class Session(PageSession):
     def _jump(self, go: Callable[[], DeskState]) -> None:
         before = self.history.state
         go()
-        self._follow(before)
         self._say("")
-        self._sync()
+        self._follow(before)
+        self._sync(fit=True)
 
     def _load(self, content: str) -> None:
         try:
@@ -393,11 +397,13 @@ class Session(PageSession):
         try:
             self.views[SpotsView] = spots_view(scene)
         except PachonError as error:
-            # The last good state comes back.
-            self.history.undo()
+            # The last state that was drawn comes back, as its pictures are there.
+            if self._drawn is not None:
+                self.history.refuse(self._drawn)
             self._say(error)
-            self._sync()
+            self._sync(fit=True)
             return
+        self._drawn = scene.state
         self._update(OpdView, lambda: opd_view(scene))
         if self._changed_heights and self.bench.camera is not None:
             self._update(HeightsView, lambda: heights_view(scene.focal_plane or self.bench.flat))

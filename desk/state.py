@@ -203,6 +203,18 @@ class History:
         """Go on by one step, where one was undone."""
         return self._go(1)
 
+    def refuse(self, last_good: DeskState) -> None:
+        """Take out the state now, which cannot be drawn, and go to the last one that was.
+
+        A drag may have put it in place of that one. It leaves nothing to redo.
+        """
+        before, after = self._states[: self._index], self._states[self._index + 1 :]
+        if before and before[-1] == last_good:
+            self._index -= 1
+        elif not (after and after[0] == last_good):
+            before = [*before, last_good]
+        self._states, self._control = before + after, ""
+
     def settle(self) -> None:
         """End a drag: the next change is a step of its own."""
         self._control = ""

@@ -12,7 +12,7 @@ from ..core.statistics import FWHM_PER_RMS, finite_median
 from ..core.units import ARCSEC
 from ..design.images.encircled_energy import energy_curve
 from ..design.layout.layout import Layout, layout
-from ..design.metrics.field_zernikes import wavefront_zernikes
+from ..design.metrics.field_zernikes import FittedPupil, wavefront_zernikes
 from ..design.metrics.spots import spots
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
@@ -118,20 +118,21 @@ class OpdView:
     noll: np.ndarray  #: Noll indices from 4
     zernikes_nm: np.ndarray  #: coefficients of annular Zernikes [nm]
     rms_nm: float
+    pupil: FittedPupil = "full"  #: points of the Zernikes: the whole annulus, or where light passes
 
 
 def opd_view(scene: Scene) -> OpdView:
     """Return the OPD map and the annular Zernikes at the star's field."""
-    plane = scene.focal_plane
-    opd = wavefront_opd(scene.telescope, scene.field, scene.wavelength, grid=_GRID, focal_plane=plane)
+    opd = wavefront_opd(scene.telescope, scene.field, scene.wavelength, grid=_GRID, focal_plane=scene.focal_plane)
     flat = opd.without_tilt * 1e9
-    request = Request.of(scene.telescope, scene.field[None], scene.wavelength).on(plane)
-    zernikes = wavefront_zernikes(request, jmax=JMAX).coefficients[0] * 1e9
+    request = Request.of(scene.telescope, scene.field[None], scene.wavelength).on(scene.focal_plane)
+    fit = wavefront_zernikes(request, jmax=JMAX)
+    zernikes = fit.coefficients[0] * 1e9
     lit = np.isfinite(flat)
     rms = float(np.sqrt(np.mean(flat[lit] ** 2))) if lit.any() else math.nan
     step = float(opd.x[0, 1] - opd.x[0, 0]) if opd.x.shape[1] > 1 else 0.0
     half = float(np.abs(opd.x).max()) + 0.5 * abs(step)
-    return OpdView(flat, half, np.arange(4, JMAX + 1), zernikes[3:], rms)
+    return OpdView(flat, half, np.arange(4, JMAX + 1), zernikes[3:], rms, fit.pupil)
 
 
 @dataclass(frozen=True)

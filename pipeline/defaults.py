@@ -84,7 +84,8 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     if name is None:
         name = f"lsst_v3.3_{band or 'r'}"
     name = _absolute_path(name, folder, BUNDLED)
-    telescope = load_telescope(name)
+    with error_context(key=None if config.telescope is None else "telescope"):
+        telescope = load_telescope(name)
     band = band or _band_of(name, telescope)
     camera_name = None
     if config.camera is not None:
@@ -101,7 +102,9 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     active = config.active_optics
     if active.states is not None:
         active = active.model_copy(update={"states": _absolute_path(active.states, folder, (), STATE_ENDINGS)})
-    site = _with_ground_wind(load_site(site_name), atmosphere.ground_wind_m_s)
+    with error_context(key=None if atmosphere.site is None else "atmosphere.site"):
+        site = load_site(site_name)
+    site = _with_ground_wind(site, atmosphere.ground_wind_m_s)
     stars, light = config.stars, resolved_photometry(config.photometry, telescope, camera, band)
     if stars.catalogue is not None:
         width, seconds, measured = PROVISIONAL_FWHM, atmosphere.exposure_s, band_of(band, light, airmass_of(atmosphere))

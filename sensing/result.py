@@ -401,7 +401,8 @@ def _draw(fit: DonutFit, donuts: slice | list[int] | None, ax: Axes | Figure | N
         bars.set_ylabel("rms over the annulus [nm], OCS")
         bars.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=6, fontsize=7, frameon=False)
         waves = ", ".join(f"{w * 1e9:.4g}" for w in fit.wavelengths)
+        count = f"{n} of {len(fit)} donuts" if n < len(fit) else "donuts"
         figure.suptitle(
-            f"{plain_text(fit.telescope)}: donuts at {waves} nm, wavefront beyond the telescope's own", fontsize=11
+            f"{plain_text(fit.telescope)}: {count} at {waves} nm, wavefront beyond the telescope's own", fontsize=11
         )
         return figure

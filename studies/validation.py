@@ -248,7 +248,7 @@ def _loading_problems(load: Callable[[Path], Any], path: Path) -> list[PachonErr
         try:
             load(path)
         except PachonError as problem:
-            error = [problem]
+            error = [problem.within(file=path)]
     return [*(PrescriptionError(str(w.message)) for w in caught if issubclass(w.category, HeightWarning)), *error]
 
 

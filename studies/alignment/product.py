@@ -15,7 +15,7 @@ from ...core.version import VERSION
 from .loop import Alignment
 from .store import CONFIG_NAME
 
-#: A loop has converged where misalignment adds at most so many times the floor.
+#: A loop has converged where the wavefront, that of the design included, is at most so many times the floor.
 CONVERGED = 1.2
 #: Labels of logarithmic axes, as plain numbers.
 PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
@@ -61,9 +61,10 @@ def alignment_summary(alignment: Alignment) -> dict[str, Any]:
 
 def verdict(summary: dict[str, Any]) -> str:
     """Return the result of a loop in one sentence."""
-    first, limit = summary["first_visit_within_1.2_floors"], f"{CONVERGED:g} times the floor"
+    first = summary["first_visit_within_1.2_floors"]
+    limit = f"{CONVERGED:g} times the floor of {summary['floor_wavefront_nm']:.0f} nm rms, the design's included"
     late = (
-        f"in late visits misalignment adds {summary['late_added_nm']:.0f} nm rms, against a floor of "
+        f"in late visits misalignment adds {summary['late_added_nm']:.0f} nm rms, against "
         f"{summary['floor_added_nm']:.0f} nm that no correction can remove"
     )
     if first is None:

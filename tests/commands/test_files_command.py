@@ -32,6 +32,21 @@ def test_problems_are_lines_and_status_2(capsys, in_folder):
     assert [p["key"] for p in found["problems"]] == ["starz", "band"]
 
 
+def test_every_problem_names_its_file_and_key_and_an_unknown_kind_hides_no_other(capsys, in_folder):
+    (in_folder / "what.yaml").write_text("nonsense: 1\n")
+    (in_folder / "sky.yaml").write_text("stars: {catalogue: none.csv}\n")
+    (in_folder / "air.yaml").write_text("band: r\natmosphere: {site: none.yaml}\n")
+    (in_folder / "optics.yaml").write_text("band: r\ntelescope: gone.yaml\n")
+    assert main(["validate", "what.yaml", "sky.yaml", "air.yaml", "optics.yaml"]) == 2
+    captured = capsys.readouterr()
+    what, sky, air, optics = captured.out.splitlines()
+    assert captured.err == ""
+    assert what.startswith("what.yaml: none of the keys of")
+    assert sky.startswith("sky.yaml, line 1: stars.catalogue")
+    assert air.startswith("air.yaml, line 2: atmosphere.site")
+    assert optics.startswith("optics.yaml, line 2: telescope")
+
+
 @pytest.mark.long
 def test_a_schema_is_json(capsys):
     assert main(["schema", "sweep"]) == 0

@@ -136,17 +136,19 @@ def test_tolerances(summary, sentence):
 @pytest.mark.parametrize(
     ("first", "worst", "start"),
     [
-        (None, 90.0, "Not aligned: no visit comes within 1.2 times the floor; in late visits"),
-        (3, 71.0, "Aligned: visit 3 is the first within 1.2 times the floor, and all late visits are; in late visits"),
-        (3, 73.0, "Not aligned throughout: visit 3 is the first within 1.2 times the floor, but not all late visits"),
+        (None, 90.0, "Not aligned: no visit comes within {limit}; in late visits"),
+        (3, 71.0, "Aligned: visit 3 is the first within {limit}, and all late visits are; in late visits"),
+        (3, 73.0, "Not aligned throughout: visit 3 is the first within {limit}, but not all late visits"),
     ],
 )
 def test_an_alignment(first, worst, start):
+    # The floor of the whole wavefront, by which visits count, is not that of what misalignment adds.
+    start = start.format(limit="1.2 times the floor of 60 nm rms, the design's included")
     summary = {"first_visit_within_1.2_floors": first, "late_added_nm": 44.4, "floor_added_nm": 20.0}
     summary |= {"floor_wavefront_nm": 60.0, "late_worst_wavefront_nm": worst}
     sentence = alignment_verdict(summary)
     assert sentence.startswith(start)
-    assert sentence.endswith("adds 44 nm rms, against a floor of 20 nm that no correction can remove.")
+    assert sentence.endswith("adds 44 nm rms, against 20 nm that no correction can remove.")
 
 
 class Fit(SimpleNamespace):

@@ -64,3 +64,12 @@ def test_benchmarks_take_public_names_from_their_public_place(path):
     names = set(names_of(ast.parse(path.read_text(encoding="utf-8"))))
     private = {tuple(name.rpartition(".")[::2]) for name in names if not is_public(name)}
     assert {f"{'.'.join(place)}: {PLACES[place]}" for place in private if place in PLACES} == set()
+
+
+@pytest.mark.parametrize("path", BENCHMARKS, ids=lambda path: path.stem)
+def test_benchmarks_explain_themselves_on_help(path):
+    """Fourteen took --help for a number or a folder, and ended in a traceback, or began to compute."""
+    text = path.read_text(encoding="utf-8")
+    shared = any(f"from {path.stem} import" in other.read_text(encoding="utf-8") for other in BENCHMARKS)
+    assert shared or "ArgumentParser(" in text
+    assert "sys.argv" not in text

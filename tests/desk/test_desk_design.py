@@ -174,3 +174,48 @@ def test_panels_draw_where_they_are_shown_and_an_optimisation_is_one_step_to_und
     assert not panel.running
     assert panel.merits[-1] < 0.5 * panel.merits[0]
     assert session.history.undo().optics == {"S3_radius": 0.1}
+
+
+class Callbacks:
+    """A document of a page whose callbacks run when they are told to."""
+
+    session_context = object()
+
+    def __init__(self):
+        self.waiting = []
+
+    def add_timeout_callback(self, action, pause):
+        self.waiting.append(action)
+
+    def run(self):
+        while self.waiting:
+            self.waiting.pop(0)()
+
+
+@pytest.mark.long
+def test_a_refused_drag_leaves_numbers_and_pictures_of_one_state():
+    """The numbers of the state before the drag stood beside pictures of the drag; sliders reached to 1e8 um."""
+    pytest.importorskip("bokeh", reason="a desk needs Bokeh: pip install 'pachon[desk]'")
+    from pachon.desk.session import Session
+    from pachon.desk.views import SpotsView
+
+    page = Callbacks()
+    session = Session(BENCH, None, page)
+    page.run()
+    for value in (10.0, 20.0, 1e8):
+        session.set_value("optics.M2_dz", value)
+        page.run()
+    assert "does not reach the detector" in session.status.text
+    assert session.history.state.optics == {"M2_dz": 20.0}
+    np.testing.assert_array_equal(session.views[SpotsView].rms_um, spots_view(session.scene).rms_um)
+    slider = session.sliders.children[0].children[0]
+    assert (slider.start, slider.end) == (-100.0, 100.0)
+    session.redo()
+    assert session.history.state.optics == {"M2_dz": 20.0}
+    session.undo()
+    assert session.history.state.optics == {}
+    # A number that was typed is a step of its own, whatever the slider does after it.
+    session.set_value("optics.M2_dz", 5.0, drag=False)
+    session.set_value("optics.M2_dz", 8.0)
+    session.undo()
+    assert session.history.state.optics == {"M2_dz": 5.0}

@@ -102,6 +102,27 @@ def test_a_drag_is_one_step_and_undone_at_once():
     assert history.redo() == BENCH.start
 
 
+def test_a_state_that_cannot_be_drawn_gives_way_to_the_last_one_that_was():
+    first, second, third = (BENCH.start.with_value("optics.M2_dz", value) for value in (1.0, 2.0, 1e8))
+    history = History(BENCH.start)
+    for state in (first, third):  # of one drag: the second replaces the first
+        history.push(state, "optics.M2_dz")
+    history.refuse(first)
+    assert history.state == history.redo() == first
+    assert history.undo() == BENCH.start
+    history.push(third)
+    history.refuse(BENCH.start)
+    assert history.state == history.redo() == history.undo() == BENCH.start
+    # Two changes between two pictures: the first is refused when it is gone back to.
+    history.push(third)
+    history.push(second)
+    assert history.undo() == third
+    history.refuse(second)
+    assert history.state == second
+    assert history.undo() == BENCH.start
+    assert history.redo() == history.redo() == second
+
+
 def test_controls_reach_every_number_and_have_units():
     assert len({control.key for control in BENCH.controls}) == len(BENCH.controls) == 50 + 5 + 4
     for control in BENCH.controls:
@@ -160,6 +181,19 @@ def test_a_star_whose_annulus_misses_the_detector_has_zernikes_of_its_lit_part()
         pachon.wavefront_zernikes(request, jmax=22, pupil="full")
     lit = pachon.wavefront_zernikes(request, jmax=22, pupil="lit").coefficients[0, 3:]
     np.testing.assert_allclose(opd_view(scene).zernikes_nm, 1e9 * lit, rtol=1e-9)
+
+
+def test_stopped_rays_without_a_smooth_wavefront_have_no_part_in_zernikes():
+    """HSC at 0.6 degrees: terms of the whole annulus were 24.7 um rms, the wavefront of the light 0.25 um."""
+    bench = Bench("hsc")
+    scene = Scene.of(bench, replace(bench.start, field_deg=(0.0, 0.6)))
+    view = opd_view(scene)
+    lit = pachon.wavefront_zernikes(bench.nominal, scene.field, scene.wavelength, jmax=22, pupil="lit")
+    assert view.pupil == "lit"
+    np.testing.assert_allclose(view.zernikes_nm, 1e9 * lit.coefficients[0, 3:], rtol=1e-9)
+    names = {}
+    exec(python_text(bench, scene.state), names)
+    np.testing.assert_allclose(names["zernikes"].coefficients[0, 3:] * 1e9, view.zernikes_nm, rtol=1e-9)
 
 
 def test_encircled_energy_is_of_all_light_not_of_that_on_the_stamp():

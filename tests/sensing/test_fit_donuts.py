@@ -528,6 +528,8 @@ def test_tables_summaries_and_pictures(behind_focus, clean):
     np.testing.assert_allclose(fit.residuals[0], fit.images[0] - fit.model[0])
     figure = fit.plot()
     assert len(figure.axes) >= 7
+    assert ": donuts at" in figure.get_suptitle()
+    assert ": 1 of 2 donuts at" in fit.plot([0]).get_suptitle()
     # The legend hides no bar, and what was not fitted of a large stamp is cut off.
     figure.canvas.draw()
     (bars,) = (axes for axes in figure.axes if axes.get_legend())

@@ -339,4 +339,4 @@ def test_a_damaged_configuration_of_the_visits_is_named(tmp_path, capsys, comman
     path.write_text("run: {atmosphere: {site: gerro_pachon}}\n")
     assert main([command, str(tmp_path), "--quiet"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"pachon: error: {path}: run: unknown site 'gerro_pachon'")
+    assert line.startswith(f"pachon: error: {path}: run.atmosphere.site: unknown site 'gerro_pachon'")
