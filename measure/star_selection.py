@@ -161,6 +161,8 @@ def flag_stars(
     star = _median_star(images[usable])
     peak = star.max()
     wings, core = (star > _WINGS[0] * peak) & (star < _WINGS[1] * peak), star > _CORE * peak
+    if not wings.any():
+        raise DomainError("stamps: the median star has no wings; expected stars that fade towards the edges of stamps")
     block = ndimage.uniform_filter(star, 3, mode="constant") * 9.0
     fraction = min(_SHARPER * peak / block[np.unravel_index(star.argmax(), star.shape)], 0.9)
     allowance = _PSF_CHANGE * np.sqrt(np.maximum(star, 0.0) * peak)

@@ -13,6 +13,8 @@ from .polynomial import Extent, term_count
 
 #: Signal-to-noise ratio above which softened weights grow no more.
 SOFTENING = 100.0
+# Largest distance of a star from the middle of the extent, in its sides: powers of more have no digits left.
+_FARTHEST = 1e3
 
 
 def as_stamps(stamps: Any, masks: Any = None) -> tuple[np.ndarray, np.ndarray]:
@@ -100,6 +102,14 @@ def as_extent(extent: Any, positions: np.ndarray) -> Extent:
     if not (xmin < xmax and ymin < ymax and np.all(np.isfinite([xmin, xmax, ymin, ymax]))):
         raise DomainError(
             f"extent = {(xmin, xmax, ymin, ymax)}: expected (xmin, xmax, ymin, ymax), minima below maxima"
+        )
+    away = np.abs(positions - [0.5 * (xmin + xmax), 0.5 * (ymin + ymax)]) / [xmax - xmin, ymax - ymin]
+    if away.max() > _FARTHEST:
+        star = int(away.max(axis=1).argmax())
+        x, y = positions[star].tolist()
+        raise DomainError(
+            f"positions: star {star} at ({x:g}, {y:g}) is {away.max():.3g} times the extent away from its middle; "
+            f"expected at most {_FARTHEST:g}"
         )
     return float(xmin), float(xmax), float(ymin), float(ymax)
 

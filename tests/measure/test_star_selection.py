@@ -146,6 +146,8 @@ def test_bad_arguments():
     for name in ("gain", "threshold", "saturation"):
         with pytest.raises(DomainError, match=f"{name} = 0"):
             flag_stars(stamps, NOISE, **{name: 0.0})
+    with pytest.raises(DomainError, match="the median star has no wings"):
+        flag_stars(np.ones_like(stamps), NOISE)
     with pytest.raises(DomainError, match="2 of 2 stars are usable: expected at least 3"):
         flag_stars(stamps[:2], NOISE)
     rng = np.random.default_rng(0)

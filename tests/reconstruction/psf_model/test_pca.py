@@ -313,6 +313,9 @@ def test_bad_arguments():
     for extent in ((0.0, 1.0), (1.0, 0.0, 0.0, 1.0), (0.0, np.nan, 0.0, 1.0), "all"):
         with pytest.raises(DomainError, match="extent"):
             fit(stamps, places, n_components=3, extent=extent)
+    far = np.where(np.arange(12)[:, None] == 3, 1e9, places)
+    with pytest.raises(DomainError, match=r"positions: star 3 at .* is .* times the extent away from its middle"):
+        fit(stamps, far, n_components=3, extent=(-1.0, 1.0, -1.0, 1.0))
     model = fit(stamps, places, n_components=3)
     with pytest.raises(DomainError, match="positions"):
         model.at(np.zeros((3, 3)))
