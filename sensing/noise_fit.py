@@ -65,7 +65,7 @@ def _fit_with_known_noise(
 ) -> StarFit:
     """Fit one star, and again where the level of its background is that of a sky left in, or of one taken off twice."""
     # The level beside a donut is that of the sky or above it.
-    level = min(faint_level(smoothed(image, used), used), 0.0) if begun is None else light_level(begun)
+    level = min(faint_level(smoothed(image, used), used), 0.0)
     least_change = _LEVEL_CHANGE * float(np.median(variance))
 
     def at_level(level: float, begun: StarFit | None) -> StarFit:
