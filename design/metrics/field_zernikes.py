@@ -269,24 +269,25 @@ def wavefront_zernikes(
     terms = (annular_zernikes(jmax, x, y, telescope.pupil_obscuration) if noll else fringe_zernikes(jmax, x, y)).T
     coefficients, residual = np.empty((len(points), jmax)), np.empty(len(points))
     fitted: FittedPupil = "lit" if pupil == "lit" else "full"
-    smooth_terms = annular_zernikes(min(_SMOOTH_TERMS, len(sample)), x, y, telescope.pupil_obscuration).T
     for rows, batch in request.parts():
         value, lit = _wavefronts(batch)
-        if pupil == "auto" and not _smooth(value, lit, smooth_terms, batch):
+        if pupil == "auto" and not _smooth(value, lit, batch):
             return wavefront_zernikes(request, jmax=jmax, pupil="lit", ordering=ordering)
         used = np.isfinite(value) & (lit | (fitted == "full"))
         coefficients[rows], residual[rows] = _fit(terms, value, used, sample.weights, batch.fields, fitted)
     return FieldZernikes(request, coefficients, residual, telescope.pupil_obscuration, fitted, ordering)
 
 
-def _smooth(value: np.ndarray, lit: np.ndarray, terms: np.ndarray, request: Request) -> bool:
+def _smooth(value: np.ndarray, lit: np.ndarray, request: Request) -> bool:
     """Return whether wavefronts [n_field, n_pupil] are smooth beyond the apertures that cut their light."""
-    weights = request.pupil.weights
-    stopped = lit @ weights < _MOSTLY_LIT * weights.sum()
     if not np.isfinite(value).all():
         return False
+    weights = request.pupil.weights
+    stopped = lit @ weights < _MOSTLY_LIT * weights.sum()
     if not stopped.any():
         return True
+    x, y = request.unit_pupil.T
+    terms = annular_zernikes(min(_SMOOTH_TERMS, len(weights)), x, y, request.telescope.pupil_obscuration).T
     used = np.ones_like(lit[stopped])
     _, residual = _fit(terms, value[stopped], used, weights, request.fields[stopped], "full")
     return bool(residual.max() <= _SMOOTH_RESIDUAL * request.wavelength)
