@@ -18,6 +18,7 @@ from ..measure.catalogue.few_stars import FEWEST_STARS, LEAST_FWHM, named_stars,
 from ..measure.catalogue.objects import DetectedObjects
 from ..measure.catalogue.star_locus import STAMP_SIDE, StarSelection, select_stars, stamp_side
 from ..measure.shapes import measure_shapes
+from ..measure.star_flux import with_unit_flux
 from ..measure.star_selection import flag_stars
 from ..reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
 from ..reconstruction.psf_model.model import PsfModel
@@ -238,12 +239,11 @@ def focal_plane_stars(
 
 def _ccd_stars(image: CcdImage, stars: StarSelection, weight_fwhm: float) -> CcdStars:
     """Return the selected stars of an image with the noise of its sky."""
-    flux = stars.stamps.sum(axis=(1, 2))
-    stamps = stars.stamps / flux[:, None, None]
+    stamps, flux = with_unit_flux(stars.stamps)
     shapes = measure_shapes(stamps, image.pixel_scale, weight_fwhm)
     level = sky_variance(image) * image.gain**2
     x, y = image.pixels_of_ccd(stars.positions).T
-    good = (flux > 0.0) & (shapes.flags == 0)
+    good = np.isfinite(flux) & (shapes.flags == 0)
     values = np.stack([shapes.e1, shapes.e2, np.log(np.where(good, shapes.size, 1.0))], axis=1)
     good[good] = regular_shapes(values[good], stars.snr[good], stars.positions[good])
     return CcdStars(image.name, x, y, shapes, flux * image.gain, (level, 0.0), stamps, good)

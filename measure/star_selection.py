@@ -16,6 +16,7 @@ from ..core.statistics import median_image, row_medians
 from ..core.units import pure_numbers, real_array
 from .masked_moments import MOST_MASKED
 from .pixel_masks import bad_pixels, fill_symmetric
+from .star_flux import with_unit_flux
 
 # Standard deviation of the PSF within a CCD, as a fraction of the geometric mean of the pixel's value and the peak's.
 _PSF_CHANGE = 0.05
@@ -152,13 +153,14 @@ def flag_stars(
     bad = bad_pixels(images)
     if bad.any():
         images = fill_symmetric(images, bad)
-    total = images.sum(axis=(1, 2))
-    usable = np.isfinite(total) & (total > 0.0)
+    # The sum over a wide stamp of a faint star may be nothing.
+    unit_stars, flux = with_unit_flux(images)
+    usable = flux > 0.0
     flags[~usable] = StarFlag.UNUSABLE
     if usable.sum() < _FEWEST:
         stars = counted(count, "star is", "stars are")
         raise DomainError(f"{int(usable.sum())} of {stars} usable: expected at least {_FEWEST} to compare")
-    star = _median_star(images[usable])
+    star = _median_star(unit_stars[usable])
     peak = star.max()
     wings, core = (star > _WINGS[0] * peak) & (star < _WINGS[1] * peak), star > _CORE * peak
     if not wings.any():
@@ -213,8 +215,8 @@ def flag_stars(
 
 
 def _median_star(images: np.ndarray) -> np.ndarray:
-    """Return the median of the stars scaled to their own bright pixels, of unit sum."""
-    star = median_image(images / images.sum(axis=(1, 2), keepdims=True))
+    """Return the median of stars of unit flux scaled to their own bright pixels, of unit sum."""
+    star = median_image(images)
     bright = star > 0.2 * star.max()
     scale = row_medians(images[:, bright] / star[bright])
     good = scale > 0.0

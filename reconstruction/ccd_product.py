@@ -292,7 +292,7 @@ class CcdProduct(CcdStars):
     pixel_scale: float  #: angle of a stamp's pixel [rad]
     noise: tuple[float, float]  #: sky and rms noise without light [electrons/pixel]
     holdout_images: np.ndarray  #: float32 [n, ny, nx], centred, unit sum; empty if not read
-    observed_images: np.ndarray  #: likewise; NaN where a star could not be centred
+    observed_images: np.ndarray  #: likewise, unit flux; NaN where a star could not be centred
     model: PsfModel  #: fitted to the observed stars
     noise_free_model: PsfModel  #: fitted to the noise-free PSFs
 
@@ -333,7 +333,7 @@ def write_product(
     hdus = [
         table_hdu("STARS", _stars_table(product.observed)),
         table_hdu("TRUTH", _stars_table(product.holdout)),
-        image_hdu("STAMPS", product.observed_images, "each star centred, of unit sum"),
+        image_hdu("STAMPS", product.observed_images, "each star centred, of unit flux"),
         image_hdu("TRUTH_PSF", product.holdout_images, "each PSF centred, of unit sum"),
         *product.model.to_hdus(_MODEL),
         *product.noise_free_model.to_hdus(_NOISE_FREE_MODEL),

@@ -12,7 +12,8 @@ from ...core.errors import PachonError, attempt
 from ...core.groups import rows_of, slices_of
 from ...core.random_streams import stream
 from ...measure.shapes import Shapes, measure_shapes
-from ...measure.stamps import center_stamps, observe_stamps, with_unit_sum
+from ...measure.stamps import center_stamps, observe_stamps
+from ...measure.star_flux import with_unit_flux
 from ...measure.star_selection import StarFlag, flag_stars
 from ..experiment import Experiment
 from ..sensor.brighter_fatter import brighter_fatter
@@ -25,7 +26,7 @@ class Observation:
     """Observed stars of a CCD."""
 
     noise: tuple[float, float]  #: sky and rms noise without light [electrons/pixel]
-    images: np.ndarray  #: [n, size, size], centred on a pixel, unit sum; NaN where not possible
+    images: np.ndarray  #: [n, size, size], centred on a pixel, unit flux; NaN where not possible
     shapes: Shapes  #: of the images; e and size are NaN where a defect was detected
     defects: np.ndarray  #: :class:`~.StarFlag` bits of detected defects, [n]; 0 without a search
     used: np.ndarray  #: [n] bool: whether the star is good enough for the PSF model
@@ -68,7 +69,7 @@ def observe_ccds(
     together = np.concatenate(groups)
     first = measure_shapes(together, pixel_scale, experiment.weight_fwhm)
     centred = center_stamps(together, first.x, first.y, size=experiment.stamp_size, normalize=False)
-    stamps = with_unit_sum(centred)
+    stamps = np.concatenate([with_unit_flux(centred[part])[0] for part in slices_of(groups)])
     shapes = measure_shapes(stamps, pixel_scale, experiment.weight_fwhm)
     parts = iter(slices_of(groups))
 

@@ -363,7 +363,7 @@ class FocalPlanePsf(ModelFields, Result):
         places, noise = replace(self.field.data.places[finite], amplitude=None), self.field.data.noise[finite]
         weight = 1.0 / np.maximum(noise[:, 0], np.percentile(noise[:, 0], 10))
         mean = np.einsum("n,nyx->yx", weight / weight.sum(), stamps)
-        model = replace(self, mean_star=mean, pixel_scale=given.pixel_scale)
+        model = replace(self, mean_star=mean / mean.sum(), pixel_scale=given.pixel_scale)
         if components < 1:
             return model
         with reporter.stage("residual stamps"):

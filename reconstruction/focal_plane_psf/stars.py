@@ -50,7 +50,7 @@ class CcdStars(NamedTuple):
     shapes: Shapes | ObservedStars  #: measured on the stamps
     electrons: np.ndarray  #: of each star
     noise: tuple[float, float]  #: sky, and rms noise without light [electrons/pixel]
-    stamps: np.ndarray  #: centred, of unit sum, [n, ny, nx]
+    stamps: np.ndarray  #: centred, of unit flux, [n, ny, nx]
     used: np.ndarray  #: stars to use, [n] bool
 
     def columns(self) -> tuple[np.ndarray, ...]:
@@ -77,7 +77,7 @@ class FocalPlaneStars(Result):
     noise : ndarray, shape [n, 3]
         Standard deviations of their noise; that of ln size is relative.
     stamps : ndarray, shape [n, ny, nx], or None
-        Centred images of unit sum.
+        Centred images of unit flux.
     pixel_scale : float or None
         Angle of a pixel of the stamps [rad].
     weight_fwhm : float
@@ -302,7 +302,7 @@ def photon_noise(
     Parameters
     ----------
     stamps : ndarray, shape [n, ny, nx]
-        Stars of unit sum.
+        Stars of unit flux.
     electrons : ndarray, shape [n]
         Of each star.
     level : ndarray, shape [n]

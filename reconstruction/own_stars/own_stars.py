@@ -19,6 +19,7 @@ from ...core.units import positive_angle, real_array, require_positive, require_
 from ...measure.pixel_masks import clipped_stars, fill_symmetric
 from ...measure.shapes import fwhm, measure_shapes
 from ...measure.stamps import center_masks, decenter_masks, shift_to_middle
+from ...measure.star_flux import with_unit_flux
 from ...measure.star_selection import StarFlag, flag_stars, require_stars
 from ..psf_model import kriging
 from ..psf_model.checks import as_extent
@@ -241,7 +242,7 @@ def fit_own_stars(
     good = stars.images[used]
     used_masks = masks_of(stars.filled, used)
     model = fit(used_indices)
-    flux = good.sum(axis=(1, 2))
+    unit_stars, flux = with_unit_flux(good)
     kriging.require_electrons(flux * gain, gain)
     return OwnStars(
         model,
@@ -250,7 +251,7 @@ def fit_own_stars(
         stars.flags,
         used,
         shapes,
-        good / flux[:, None, None],
+        unit_stars,
         used_masks,
         flux * gain,
         parts,

@@ -60,7 +60,7 @@ class OwnStars(Result):
     shapes : Shapes
         Of the stars, angles in rad.
     stamps : ndarray
-        Used stars of unit sum, [n_used, ny, nx].
+        Used stars of unit flux, [n_used, ny, nx].
     masks : ndarray
         Pixels of `stamps` without weight, which hold the model in place of the star, bool [n_used, ny, nx].
     electrons : ndarray
@@ -156,10 +156,9 @@ class OwnStars(Result):
         psf = self.predicted.mean(axis=0)
         deviations = (self.stamps - psf).reshape(len(self.stamps), -1)
         filters = shape_numbers(psf, deviations, weight_sigma(self.pixel_scale, self.weight_fwhm) ** 2)[1]
-        images = self.stamps * self.electrons[:, None, None]
         # Shape numbers are twice the changes of e and of the logarithm of the size.
         masked = self.masks if self.masks.any() else None
-        return 0.5 * np.sqrt(star_noise(images, deviations, psf, filters, 1.0, masked))
+        return 0.5 * np.sqrt(star_noise(self.electrons, deviations, psf, filters, masked))
 
     def residuals(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return e1, e2 and relative size of the used stars less those predicted without them, [n_used] each."""

@@ -9,6 +9,7 @@ import numpy as np
 from ...core.errors import ConfigError, DomainError
 from ...core.units import real_array
 from ...measure.pixel_masks import bad_pixels
+from ...measure.star_flux import star_fluxes
 from .polynomial import Extent, term_count
 
 #: Signal-to-noise ratio above which softened weights grow no more.
@@ -34,8 +35,11 @@ def as_stamps(stamps: Any, masks: Any = None) -> tuple[np.ndarray, np.ndarray]:
         images = np.where(bad, 0.0, images)
     dark = images.sum(axis=(1, 2)) <= 0.0
     if dark.any():
+        pixels = images.reshape(len(images), -1)
+        dark &= ~(star_fluxes(pixels, ~bad.reshape(pixels.shape) if bad.any() else None) > 0.0)
+    if dark.any():
         unmasked = " outside its mask" if bad.any() else ""
-        raise DomainError(f"stamps[{dark.argmax()}] sums to zero or less{unmasked}: expected a star")
+        raise DomainError(f"stamps[{dark.argmax()}] has no light{unmasked}: expected a star")
     return images, bad
 
 

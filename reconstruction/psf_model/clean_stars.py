@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...measure.star_flux import star_fluxes
 from .masked_pixels import fill_masked, mean_and_flux
 from .outliers import SigmaClipping, find_outliers, restore_predicted
 
@@ -17,15 +18,16 @@ class CleanStars:
     mean: np.ndarray  #: mean of the stars, [n_pixels], unit sum
     deviations: np.ndarray  #: of the stars from it, [n_stars, n_pixels]
     rejected: np.ndarray  #: outliers, [n_stars, n_pixels] bool
+    flux: np.ndarray  #: of the stars, [n_stars], in the unit of their stamps
 
     def of_stars(self, chosen: np.ndarray) -> CleanStars:
         """Return some of the stars, about the same mean."""
-        return CleanStars(self.mean, self.deviations[chosen], self.rejected[chosen])
+        return CleanStars(self.mean, self.deviations[chosen], self.rejected[chosen], self.flux[chosen])
 
     def about_weighted_mean(self, weights: np.ndarray) -> CleanStars:
         """Return the stars about their mean with weights [n_stars]."""
         shift = weights @ self.deviations / weights.sum()
-        return CleanStars(self.mean + shift, self.deviations - shift, self.rejected)
+        return CleanStars(self.mean + shift, self.deviations - shift, self.rejected, self.flux)
 
 
 def cleaned_stars(
@@ -48,9 +50,12 @@ def cleaned_stars(
         rejected = find_outliers(pixels, clipping.sigma, clipping.max_iterations) & ~filled_pixels
     mean, flux = mean_and_flux(pixels, rejected)
     if rejected.any():
-        rejected = restore_predicted(pixels / pixels.sum(axis=1)[:, None], mean, rejected, terms)
+        rejected = restore_predicted(pixels / star_fluxes(pixels, profile=mean)[:, None], mean, rejected, terms)
         mean, flux = mean_and_flux(pixels, rejected)
     deviations = np.where(rejected, 0.0, pixels / flux[:, None] - mean)
+    # What the sum of a star of this flux still differs from one by is noise of all pixels.
+    excess = deviations.sum(axis=1) / np.maximum((~rejected).sum(axis=1), 1)
+    deviations -= np.where(rejected, 0.0, excess[:, None])
 
     by_mean = rejected & (clipping is not None and clipping.replacement == "mean")
     filled_pixels = filled_pixels | (rejected & ~by_mean)
@@ -58,4 +63,4 @@ def cleaned_stars(
         stars = fill_masked(mean + deviations, filled_pixels, by_mean, terms)
         mean = stars.mean(axis=0)
         deviations = np.where(by_mean, 0.0, stars - mean)
-    return CleanStars(mean, deviations, rejected)
+    return CleanStars(mean, deviations, rejected, flux)

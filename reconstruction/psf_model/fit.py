@@ -113,12 +113,13 @@ def _star_field(
     interpolation.check_terms(terms[:, : term_count(needed_order)], needed_order, points, star_weights)
     stars = cleaned_stars(images, bad, smooth_terms, clipping)
     masked = bad if bad.any() else None
-    if masked is not None:
-        images = _completed(images, masked, stars)
+    if interpolation.needs_noise and gain is not None:
+        kriging.require_electrons(stars.flux * gain, gain)
+    electrons = _electrons(stars.flux, gain)
     chosen_order, basis_weights = orders[-1], None
     if by_noise or automatic:
         mean = stars.mean.reshape(ny, nx)
-        shapes = ShapeNoise.of(images, stars.deviations, mean, _checked_gain(images, gain), masked)
+        shapes = ShapeNoise.of(electrons, stars.deviations, mean, masked)
         if automatic:
             counts = np.arange(1, count + 1) if basis.automatic else np.array([count])
             chosen_order, count = choose_by_cross_validation(
@@ -133,17 +134,9 @@ def _star_field(
     coefficients, unexplained = fitted_basis.project(stars)
     order_terms = terms[:, : term_count(order)]
     field = StarField(
-        points, span, order, order_terms, coefficients, star_weights, images, fitted_basis, gain, masked, colours
+        points, span, order, order_terms, coefficients, star_weights, fitted_basis, electrons, masked, colours
     )
     return field, unexplained, stars.rejected.sum(axis=1)
-
-
-def _completed(images: np.ndarray, masked: np.ndarray, stars: CleanStars) -> np.ndarray:
-    """Return images [n, ny, nx] whose masked pixels hold what the stars of unit sum have there, for their flux."""
-    profiles = (stars.mean + stars.deviations).reshape(images.shape)
-    good = np.where(masked, 0.0, profiles).sum(axis=(1, 2))
-    flux = np.where(masked, 0.0, images).sum(axis=(1, 2)) / np.where(good > 0.0, good, 1.0)
-    return np.where(masked, flux[:, None, None] * profiles, images)
 
 
 def _check_gain(gain: float | None) -> None:
@@ -152,6 +145,6 @@ def _check_gain(gain: float | None) -> None:
         raise ConfigError(f"gain = {gain}: expected a number of electrons above 0, or None for no photon noise")
 
 
-def _checked_gain(images: np.ndarray, gain: float | None) -> float | None:
-    """Return the gain; None for stamps that are not in electrons, whose photon noise is unknown."""
-    return gain if gain is not None and np.median(images.sum(axis=(1, 2))) * gain >= kriging.FEWEST_ELECTRONS else None
+def _electrons(flux: np.ndarray, gain: float | None) -> np.ndarray | None:
+    """Return the electrons of stars, [n]; None for stamps that are not in electrons, whose photon noise is unknown."""
+    return flux * gain if gain is not None and np.median(flux) * gain >= kriging.FEWEST_ELECTRONS else None

@@ -36,9 +36,8 @@ class StarField:
     terms: np.ndarray  #: of the polynomials at the stars, [n, n_terms]
     coefficients: np.ndarray  #: [n, k]
     weights: np.ndarray | None  #: of the stars, [n]; None for equal ones
-    images: np.ndarray  #: stamps, [n, ny, nx]
     basis: FittedBasis
-    gain: float | None  #: electrons in a unit of the stamps; None for no photon noise
+    electrons: np.ndarray | None  #: of the stars, [n]; None for no photon noise
     masked: np.ndarray | None = None  #: pixels of the stamps that are filled, [n, ny, nx]
     colours: StarColours | None = None  #: of the stars, where they differ
 

@@ -107,7 +107,7 @@ class _StarShapes:
         deviations = stars.basis.deviations(stars.coefficients)
         numbers, filters = shape_numbers(mean, deviations)
         sky = sky_of_stars(deviations, mean.shape, stars.masked)
-        noise = star_noise(stars.images, deviations, mean, filters, stars.gain, stars.masked, sky=sky)
+        noise = star_noise(stars.electrons, deviations, mean, filters, stars.masked, sky=sky)
         noise = np.maximum(noise, _LEAST_NOISE * (numbers**2).mean(axis=0) + np.finfo(float).tiny)
         places = mapped(stars.positions, stars.extent)
         sample = ShapeSample(places, numbers, noise, stars.with_colour_terms(), stars.colour_terms.shape[1])
@@ -130,7 +130,7 @@ class _StarShapes:
             shape_trend, dual = krige_mean(places, shapes, terms, covariances, of_stars, colour_count=colour_count)
             signal = SignalCovariance.of(covariances.kernel, places, terms, colour_count)
             at_stars = terms @ shape_trend + predict(places, places, covariances.kernel, dual)
-            pixel_noise = middle_star_noise(stars.images, self.sky, mean, of_stars, stars.gain)
+            pixel_noise = middle_star_noise(stars.electrons, self.sky, mean, of_stars)
             fields = fit_pixel_fields(mean, self.deviations, all_filters, of_stars, pixel_noise, at_stars, signal)
             residuals = fields.split(self.deviations)[1]
             residual_trend, residual_dual = krige_residuals(residuals, fields, signal, of_stars)
@@ -278,28 +278,25 @@ def core_variance(mean: np.ndarray) -> float:
 
 
 def star_noise(
-    images: np.ndarray,
+    electrons: np.ndarray | None,
     deviations: np.ndarray,
     mean: np.ndarray,
     filters: np.ndarray,
-    gain: float | None,
     masked: np.ndarray | None = None,
     *,
     sky: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the variance of the noise of the shape numbers of each star, [n, 3].
 
-    `images` [n, ny, nx] are in units of `gain` electrons, `deviations` [n, n_pixels] those of the stamps of unit sum
-    from the mean [ny, nx]. Without gain there is no photon noise. Pixels in `masked` [n, ny, nx], which are filled and
-    have no noise of their own, are left out of the scatter of the sky; `sky` is that of :func:`sky_of_stars`, if known.
+    `electrons` are those of the stars [n], `deviations` [n, n_pixels] those of the stamps of unit sum from the mean
+    [ny, nx]. Without electrons there is no photon noise. Pixels in `masked` [n, ny, nx], which are filled and have no
+    noise of their own, are left out of the scatter of the sky; `sky` is that of :func:`sky_of_stars`, if known.
     """
     sky_variance = sky_of_stars(deviations, mean.shape, masked) if sky is None else sky
     correlations = _noise_correlations(deviations.reshape(-1, *mean.shape), sky_variance, masked)
     sky_noise = (filters**2).sum(axis=1) * _correlation_factors(correlations, filters, mean.shape)
     noise = sky_variance[:, None] * sky_noise
-    if gain is not None:
-        electrons = images.sum(axis=(1, 2)) * gain
-        require_electrons(electrons, gain)
+    if electrons is not None:
         light = np.maximum(mean.ravel(), 0.0)
         photon_noise = (filters**2 @ light) * _correlation_factors(correlations, filters * np.sqrt(light), mean.shape)
         noise = noise + photon_noise / electrons[:, None]
@@ -315,15 +312,13 @@ def require_electrons(electrons: np.ndarray, gain: float) -> None:
         )
 
 
-def middle_star_noise(
-    images: np.ndarray, sky: np.ndarray, mean: np.ndarray, noise: np.ndarray, gain: float | None
-) -> np.ndarray:
+def middle_star_noise(electrons: np.ndarray | None, sky: np.ndarray, mean: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Return the variance of the noise of pixels, [n_pixels], of the star of middle `noise` [n].
 
     `sky` [n] is that of :func:`sky_of_stars`.
     """
     star = int(np.argsort(noise, kind="stable")[len(noise) // 2])
-    photons = 0.0 if gain is None else np.maximum(mean.ravel(), 0.0) / (images[star].sum() * gain)
+    photons = 0.0 if electrons is None else np.maximum(mean.ravel(), 0.0) / electrons[star]
     return np.asarray(sky[star] + photons + np.zeros(mean.size))
 
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from ...core.errors import DomainError
+from ...measure.star_flux import median_star, pixel_noise, star_fluxes
 
-# Passes end when no pixel changes by more than this fraction of the brightest pixel.
+# Passes end when no pixel, or flux, changes by more than this fraction of the greatest.
 _CONVERGED = 1e-12
 _MOST_PASSES = 100
+# Passes of means and fluxes where pixels are rejected.
+_FLUX_PASSES = 20
 # Stars in which a pixel is masked are predicted only along the directions that the others determine: an eigenvalue of
 # 1 - H under this would enlarge noise by more than seven.
 _LEAST_ROOM = 0.02
@@ -19,18 +22,29 @@ _LEAST_SCATTER = 0.25
 def mean_and_flux(pixels: np.ndarray, rejected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean PSF [n_pixels], of unit sum, and the flux of each star [n_stars].
 
-    The flux of a star is the sum of its good pixels over the mean PSF's sum there: with rejected pixels replaced by the
-    mean PSF it has unit sum. The mean depends on the fluxes in turn, so both are iterated.
+    The flux of a star is that of its good pixels over the mean PSF's sum there, as :func:`~.star_fluxes` has it. The
+    mean depends on the fluxes in turn, so both are iterated.
     """
-    flux = pixels.sum(axis=1)
-    used = ~rejected
-    used[:, rejected.all(axis=0)] = True  # a pixel that is bad in all stars has no better mean
-    count = used.sum(axis=0)
-    for _ in range(20 if rejected.any() else 1):
-        mean = np.where(used, pixels / flux[:, None], 0.0).sum(axis=0) / count
-        mean /= mean.sum()
-        if rejected.any():
-            flux = np.where(used, pixels, 0.0).sum(axis=1) / np.where(used, mean, 0.0).sum(axis=1)
+    if rejected.any():
+        used = ~rejected
+        used[:, rejected.all(axis=0)] = True  # a pixel that is bad in all stars has no better mean
+        passes, count = _FLUX_PASSES, used.sum(axis=0)
+    else:
+        used, passes, count = None, 1, len(pixels)
+    profile = median_star(pixels, used)
+    noise = pixel_noise(pixels, used, profile)
+    flux = star_fluxes(pixels, used, profile, noise)
+    for i in range(passes + 1):
+        unit = pixels / np.where(flux > 0.0, flux, np.inf)[:, None]
+        mean = (unit if used is None else np.where(used, unit, 0.0)).sum(axis=0) / count
+        if used is None:
+            mean += (1.0 - mean.sum()) / len(mean)  # noise of all pixels, as in stars
+        else:
+            mean /= mean.sum()
+        if i < passes:
+            before, flux = flux, star_fluxes(pixels, used, mean, noise)
+            if np.abs(flux - before).max() <= _CONVERGED * np.abs(flux).max():
+                break
     if not np.all(flux > 0.0):
         raise DomainError(f"stamps[{(flux > 0.0).argmin()}] has no flux left outside its outliers")
     return mean, flux

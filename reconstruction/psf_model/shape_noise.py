@@ -34,15 +34,14 @@ class ShapeNoise:
     @classmethod
     def of(
         cls,
-        images: np.ndarray,
+        electrons: np.ndarray | None,
         deviations: np.ndarray,
         mean: np.ndarray,
-        gain: float | None,
         masked: np.ndarray | None = None,
     ) -> ShapeNoise:
-        """Return it for stars [n, ny, nx] in units of `gain` electrons, as :func:`~.kriging.star_noise` has them."""
+        """Return it for stars of `electrons` [n], as :func:`~.kriging.star_noise` has them."""
         _, filters = kriging.shape_numbers(mean, deviations)
-        noise = kriging.star_noise(images, deviations, mean, filters, gain, masked)
+        noise = kriging.star_noise(electrons, deviations, mean, filters, masked)
         unit = np.maximum(np.median(noise, axis=0), np.finfo(float).tiny)
         return cls(filters / np.sqrt(unit)[:, None], np.maximum((noise / unit).mean(axis=1), _LEAST))
 

@@ -271,7 +271,7 @@ def test_the_noise_of_a_star_is_that_of_many_draws(gain):
 
     filters = kriging.shape_numbers(image, relative(truth))[1]
     scatter = np.std([kriging.shape_numbers(image, relative(draw()))[0] for _ in range(400)], axis=0)
-    stated = np.mean([kriging.star_noise(s, relative(s), image, filters, gain) for s in (draw() for _ in range(20))], 0)
+    stated = np.mean([kriging.star_noise(electrons, relative(draw()), image, filters) for _ in range(20)], 0)
     np.testing.assert_allclose(np.sqrt(stated), scatter, rtol=0.12)
 
 
@@ -283,7 +283,7 @@ def test_bright_stars_do_not_have_the_noise_of_faint_ones():
     stars = stars + rng.normal(size=stars.shape) * np.sqrt(22.0**2 + stars)
     unit = (stars / electrons[:, None, None]).reshape(24, -1)
     filters = kriging.shape_numbers(image, unit)[1]
-    stated = kriging.star_noise(stars, unit - unit.mean(axis=0), image, filters, 1.0)
+    stated = kriging.star_noise(electrons, unit - unit.mean(axis=0), image, filters)
     squares = (filters**2).sum(axis=1), filters**2 @ image.ravel()
     true = (22.0 / electrons[:, None]) ** 2 * squares[0] + squares[1] / electrons[:, None]
     # The sky of one stamp is good to a tenth (it was 20 times too large for the brightest).

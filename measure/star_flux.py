@@ -1,0 +1,113 @@
+"""Flux of stars on stamps that are wide beside the star."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..core.statistics import (
+    RMS_PER_MAD,
+    column_median,
+    finite_row_medians,
+    masked_median,
+    row_medians,
+    sorted_columns,
+)
+
+# Relative error of the fit of a profile as the PSF changes within a CCD: a sum that is known better stands.
+_PROFILE_ERROR = 0.2
+# Pixels of less than this fraction of the peak tell the noise: in brighter ones stars differ.
+_FAINT = 0.1
+# Least noise of a sum, over the flux: that of a star without noise is its sum, whatever the PSF does.
+_LEAST_NOISE = 1e-6
+
+
+def star_fluxes(
+    pixels: np.ndarray,
+    used: np.ndarray | None = None,
+    profile: np.ndarray | None = None,
+    noise: np.ndarray | None = None,
+) -> np.ndarray:
+    """Return the flux of each star [n]; that of a stamp without light is zero or negative.
+
+    A flux is the sum over the stamp unless noise has changed that. The sum over the thousands of pixels of a wide stamp
+    has ten times the noise of a fit of the mean star: a star of S/N 30 may sum to nothing. The fit is off by what the
+    PSF changes within a CCD. So the sum may differ from the fit, the less the noisier it is.
+
+    Parameters
+    ----------
+    pixels : array
+        Stars [n, n_pixels] without background, centred alike, of any unit.
+    used : array, optional
+        Pixels to use, bool [n, n_pixels]; the flux is that of the whole star.
+    profile : array, optional
+        Mean star of unit sum, [n_pixels]; by default :func:`median_star`.
+    noise : array, optional
+        Of a pixel of each star, [n]; by default :func:`pixel_noise`.
+    """
+    profile = median_star(pixels, used) if profile is None else profile
+    noise = pixel_noise(pixels, used, profile) if noise is None else noise
+    fitted = _fitted(pixels, used, profile)
+    if used is None:
+        total, noise = pixels.sum(axis=1), noise * np.sqrt(pixels.shape[1])
+    else:
+        lit = used @ profile
+        lit = np.where(lit > 0.0, lit, 1.0)
+        total, noise = np.where(used, pixels, 0.0).sum(axis=1) / lit, noise * np.sqrt(used.sum(axis=1)) / lit
+    least = np.maximum(_LEAST_NOISE * np.abs(fitted), np.finfo(float).tiny)
+    reach = fitted * (_PROFILE_ERROR**2 * fitted / np.maximum(noise, least))
+    return np.where(fitted > 0.0, np.clip(total, fitted - reach, fitted + reach), fitted)
+
+
+def pixel_noise(pixels: np.ndarray, used: np.ndarray | None, profile: np.ndarray) -> np.ndarray:
+    """Return the rms noise of the faint pixels of each star, [n], with arguments of :func:`star_fluxes`."""
+    faint = profile < _FAINT * profile.max()
+    if not faint.any():
+        return np.zeros(len(pixels))
+    deviations = np.abs(pixels[:, faint] - _fitted(pixels, used, profile)[:, None] * profile[faint])
+    if used is None:
+        return RMS_PER_MAD * row_medians(deviations)
+    return RMS_PER_MAD * np.nan_to_num(finite_row_medians(np.where(used[:, faint], deviations, np.nan)))
+
+
+def _fitted(pixels: np.ndarray, used: np.ndarray | None, profile: np.ndarray) -> np.ndarray:
+    """Return the fluxes of stars by least squares, [n]; their sums under a profile without light."""
+    if not profile.any():
+        return np.asarray((pixels if used is None else np.where(used, pixels, 0.0)).sum(axis=1))
+    if used is None:
+        return np.asarray((pixels * profile).sum(axis=1) / (profile**2).sum())
+    square = used @ profile**2
+    return np.asarray((np.where(used, pixels, 0.0) * profile).sum(axis=1) / np.where(square > 0.0, square, 1.0))
+
+
+def with_unit_flux(stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return stars [n, ny, nx] over their :func:`star_fluxes`, and these, [n]; NaN where that is not possible.
+
+    That is where a pixel is not finite, or there is no light.
+    """
+    pixels = stamps.reshape(len(stamps), stamps.shape[1] * stamps.shape[2])
+    finite = np.isfinite(pixels).all(axis=1)
+    flux = np.full(len(stamps), np.nan)
+    if finite.any():
+        flux[finite] = star_fluxes(pixels[finite])
+        flux[~(flux > 0.0)] = np.nan
+    return stamps / flux[:, None, None], flux
+
+
+def median_star(pixels: np.ndarray, used: np.ndarray | None = None) -> np.ndarray:
+    """Return the median of stars [n, n_pixels], each over its sum, [n_pixels], of unit sum.
+
+    Stars of a sum near zero, and pixels that are not the star's, do not move it. Pixels that are not `used` count in no
+    star.
+    """
+    if used is None:
+        median = column_median(sorted_columns(_over_sums(pixels)))
+    else:
+        median = np.nan_to_num(masked_median(_over_sums(np.where(used, pixels, 0.0)), ~used))
+    total = median.sum()
+    return median / (total if total > 0.0 else 1.0)
+
+
+def _over_sums(pixels: np.ndarray) -> np.ndarray:
+    """Return stars over their sums."""
+    total = pixels.sum(axis=1)
+    return np.asarray(pixels / np.where(total == 0.0, 1.0, total)[:, None])
