@@ -23,6 +23,7 @@ from ...core.random_streams import stream
 from ...core.warp_arrays import warp_array
 from ...models.zernike_polynomials import noll_to_nm
 from .field_kernels import add_wavefronts, factor_spectra, pairs, read_splines, spread_over_grid, zernikes
+from .ground_moments import GroundMoments, ground_factor
 from .mean_wavefront import mean_wavefront_covariance, radial_transform
 from .moment_covariance import (
     COARSE,
@@ -129,7 +130,7 @@ class OpticsGain(NamedTuple):
 class ExposureFields:
     """Drawn fields of one exposure."""
 
-    common: np.ndarray  #: moments that all stars share, p, q, s [rad^2], [3]
+    shared: GroundMoments  #: moments that all stars of one pupil share
     moments: SplineFields  #: those that change over the field
     by_optics: OpticsGain  #: factors of these
     common_wavefront: np.ndarray  #: Zernikes of :data:`NOLL` of the layers on the ground [m]
@@ -140,7 +141,7 @@ class ExposureFields:
 
         Stars have their squares of aberrations over the mean over the field, and lit fractions, [n] both.
         """
-        return self.common + self.by_optics.factors(square, lit) * self.moments.at(slopes)
+        return self.shared.at(slopes) + self.by_optics.factors(square, lit) * self.moments.at(slopes)
 
     def wavefronts_at(self, slopes: np.ndarray) -> np.ndarray:
         """Return Zernikes of :data:`NOLL` of the mean path [m] at field slopes [n, 2] [rad], [n, n_noll]."""
@@ -158,11 +159,15 @@ def draw_exposure(
     grid = FieldGrid.of(air, field_radius)
     factors, shared, by_optics = moment_spectrum(air, response, grid)
     random = stream(seed, "atmosphere", epoch, "moments")
-    common = shared @ random.standard_normal(3)
+    normal = random.standard_normal(3)
+    if response.pupils is not None:
+        of_nodes = stream(seed, "atmosphere", epoch, "pupils").standard_normal(len(shared) - 3)
+        normal = np.concatenate([normal, of_nodes])
+    of_pupils = GroundMoments.draw(shared, response.pupils, normal)
     modes = [_white_modes(random, grid.size, grid.size // 2 + 1, grid.size) for _ in range(3)]
     moments = _fields((sum(f * m for f, m in zip(row, modes, strict=False)) for row in factors), 3, grid.size)
     ground, wavefronts = _draw_wavefronts(air, grid, seed, epoch)
-    return ExposureFields(common, SplineFields(grid.side, moments), by_optics, ground, wavefronts)
+    return ExposureFields(of_pupils, SplineFields(grid.side, moments), by_optics, ground, wavefronts)
 
 
 @lru_cache(maxsize=4)
@@ -171,8 +176,8 @@ def moment_spectrum(
 ) -> tuple[tuple[tuple[np.ndarray, ...], ...], np.ndarray, OpticsGain]:
     """Return lower Cholesky factors of the spectra of the moments on a grid, and that of what all stars share.
 
-    Factors of row i are i + 1 arrays [size, size // 2 + 1] [rad^2], with the gain of splines; the other is [3, 3]. The
-    last result are the amplitudes of stars of other optics.
+    Factors of row i are i + 1 arrays [size, size // 2 + 1] [rad^2], with the gain of splines; the other is that of
+    :func:`.ground_factor`. The last result are the amplitudes of stars of other optics.
     """
     of_orders, polar_lags, polar, far = _polar_covariances(air, response, grid, 0.5)
     images = bool(np.any(np.ptp(far, axis=0)[:3] > _UNEVEN * (polar[0, 0] - far.mean(axis=0))[:3]))
@@ -199,7 +204,8 @@ def moment_spectrum(
     spectra = scipy.fft.hfft(scipy.fft.rfft(covariance), grid.size, axis=1, overwrite_x=True)
     variance = np.maximum(polar[0, 0, :3], 1e-12 * scale)
     gain = OpticsGain(of_orders.parts(response)[2, 0] / variance, *amplitudes_by_light(air, response, 0.5 * grid.side))
-    return _factors(spectra, scale), np.linalg.cholesky(shared + 1e-12 * scale * np.eye(3)), gain
+    of_pupils = ground_factor(air, response.lit, response.pupils, shared + 1e-12 * scale * np.eye(3))
+    return _factors(spectra, scale), of_pupils, gain
 
 
 def _polar_covariances(

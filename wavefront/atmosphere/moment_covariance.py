@@ -38,6 +38,7 @@ import warp as wp
 from ...core.launch import launch
 from ...core.warp_arrays import warp_array
 from .atmosphere import Atmosphere
+from .field_pupils import FieldPupils
 from .moment_kernels import LANES, SLOPES, TERMS, average_products, baselines, products_with_mean_slope
 from .slope_covariance import slope_covariance
 from .turbulence import diffraction_otf
@@ -61,7 +62,7 @@ _SIXTH = np.array([1.0 / 96.0, 1.0 / 96.0, 1.0 / 144.0])
 # The same of the third order and a slope of the optics of any direction.
 _THIRD = np.array([2.0 / 3.0, 2.0 / 3.0, 1.0 / 2.0])
 # Slopes in microradians: the fourth powers of their covariances, in radians, are below the least number of float32.
-_MICRO = 1e-6
+MICRO = 1e-6
 
 
 class MomentSampling(NamedTuple):
@@ -142,6 +143,7 @@ class MomentResponse(NamedTuple):
     lit: tuple[float, ...] = (1.0,)
     #: The same of stars of about as much light, from the darkest on.
     lit_levels: tuple[tuple[float, ...], ...] = ()
+    pupils: FieldPupils | None = None  #: of stars; None where all have one pupil
 
     @classmethod
     def of(cls, wavenumber: np.ndarray, transfer: np.ndarray, weight_rms: float) -> Self:
@@ -220,19 +222,30 @@ def moment_covariance(
 
     Aberration and lit pairs are those of :class:`MomentResponse`.
     """
-    lag, delays = np.asarray(lags, dtype=np.float64).reshape(-1, 2), _Delays.of(air, aberration, lit, sampling)
+    lag, delays = np.asarray(lags, dtype=np.float64).reshape(-1, 2), Delays.of(air, aberration, lit, sampling)
     # All stars share the layers on the ground.
     ground = np.zeros(delays.baseline.shape, dtype=np.float32)
     _, common = _averages(air.on_ground(), np.zeros((1, 2)), delays, np.zeros((0, TERMS)), ground, threads)
     squares, slopes = _averages(air, lag, delays, common[0], ground, threads)
-    second = squares[:, :6] - _by_mean_slope(slopes, delays, air.exposure, threads)
-    factors = (_FOURTH * _MICRO**8, _SIXTH * _MICRO**12, _THIRD * _MICRO**8)
+    second = squares[:, :6] - by_mean_slope(slopes, delays, air.exposure, threads)
+    factors = (_FOURTH * MICRO**8, _SIXTH * MICRO**12, _THIRD * MICRO**8)
     higher = [terms * factor for terms, factor in zip(np.split(squares[:, 6:], 3, axis=1), factors, strict=True)]
-    return MomentCovariance(second * _MICRO**4, np.stack(higher))
+    return MomentCovariance(second * MICRO**4, np.stack(higher))
+
+
+def ground_slopes(air: ExposedAir, delays: Delays) -> np.ndarray:
+    """Return covariances a, b, c of slopes of the layers on the ground at the baselines, [3, n_packet, LANES].
+
+    They are in microradians.
+    """
+    ground = np.zeros(delays.baseline.shape, dtype=np.float32)
+    _averages(air.on_ground(), np.zeros((1, 2)), delays, np.zeros((0, TERMS)), ground, None)
+    packets = len(delays.baseline)
+    return np.moveaxis(ground.ravel()[: SLOPES * packets * LANES].reshape(packets, SLOPES, LANES), 1, 0)
 
 
 def _averages(
-    air: ExposedAir, lag: np.ndarray, delays: _Delays, common: np.ndarray, ground: np.ndarray, threads: int | None
+    air: ExposedAir, lag: np.ndarray, delays: Delays, common: np.ndarray, ground: np.ndarray, threads: int | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return squares [n_lag, 15] and terms [n_lag, n_delay, 3] in microradians, see :func:`.average_products`.
 
@@ -253,7 +266,7 @@ def _averages(
             warp_array(air.altitudes),
             warp_array(np.array(air.velocities, dtype=np.float64).reshape(-1, 2)),
             warp_array(air.weights, wp.float32),
-            warp_array(np.stack([table.isotropic, table.directed], axis=1) / _MICRO**2, wp.vec2f),
+            warp_array(np.stack([table.isotropic, table.directed], axis=1) / MICRO**2, wp.vec2f),
             1.0 / table.step,
             air.diameter + min(_DISTANT, table.reach),
             air.diameter + table.reach,
@@ -269,7 +282,7 @@ def _averages(
 
 
 @dataclass(frozen=True, eq=False)
-class _Delays:
+class Delays:
     """Delays between two moments of an exposure, and baselines of the pupil for each."""
 
     time: np.ndarray  #: [s], rising, [n_delay]
@@ -326,7 +339,7 @@ class _Delays:
         light = baseline[:, 2] * both_lit
         total = np.add.reduceat(light.sum(axis=1), start[:-1])
         light /= np.repeat(total, np.diff(start))[:, None]
-        baseline = np.stack([baseline[:, 0], baseline[:, 1], light, light * covariance / _MICRO**2], axis=1)
+        baseline = np.stack([baseline[:, 0], baseline[:, 1], light, light * covariance / MICRO**2], axis=1)
         baseline = baseline.astype(np.float32)
         return cls(time, width, weight / weight.sum(), start, baseline)
 
@@ -349,7 +362,22 @@ def _pupil_baselines(diameter: float, obscuration: float, spacing: float, count:
     return np.moveaxis(packed.reshape(count, 3, -1, LANES), 2, 1)
 
 
-def _by_mean_slope(slopes: np.ndarray, delays: _Delays, exposure: float, threads: int | None) -> np.ndarray:
+def wick_products(slopes: np.ndarray) -> np.ndarray:
+    """Return Wick's products, of :data:`PAIRS`, [6, ...], of covariances a, b, c of slopes [3, ...]."""
+    a, b, c = slopes
+    return np.stack(
+        [
+            2.0 * (a * a + c * c - 2.0 * b * b),
+            4.0 * (a * c + b * b),
+            2.0 * (a * a + 2.0 * b * b + c * c),
+            4.0 * b * (a - c),
+            2.0 * (a * a - c * c),
+            4.0 * b * (a + c),
+        ]
+    )
+
+
+def by_mean_slope(slopes: np.ndarray, delays: Delays, exposure: float, threads: int | None = None) -> np.ndarray:
     """Return what the moments' covariances lose by the mean slope, of :data:`PAIRS`, [n_lag, 6].
 
     ``slopes`` [n_lag, n_delay, 3] are covariances a, b, c of slopes a delay apart, means over the baselines; they are

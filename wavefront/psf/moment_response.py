@@ -36,4 +36,6 @@ def moment_response(inputs: PsfInputs, means: PupilMeans, focal_length: float, w
     mean = (turbulence * diffraction).mean(axis=0)
     spread = spread * np.exp(-0.25 * means.aberration[0] * k**2)
     response = MomentResponse.of(k, mean * pixel * spread, weight)
-    return response._replace(aberration=means.aberration, lit=means.lit, lit_levels=means.lit_levels)
+    return response._replace(
+        aberration=means.aberration, lit=means.lit, lit_levels=means.lit_levels, pupils=means.pupils
+    )

@@ -10,6 +10,7 @@ import numpy as np
 from ...core.errors import DomainError
 from ...models.telescope import Telescope
 from ...raytrace.rays import Projection, field_direction
+from ..atmosphere.field_pupils import FieldPupils
 from ..pupil_sampling import spiral_annulus
 from .clear_pupil import lit_points
 from .engine import PsfInputs
@@ -29,6 +30,14 @@ _LIGHT_POINTS = 200
 _LIT_LEVELS = np.array([0.15, 0.3, 0.45, 0.6, 0.75, 0.9])
 # Pupils of less light are left out.
 _LEAST_LIT = 0.05
+# Cells across the pupils of stars, and rays across a cell.
+_CELLS = 12
+_CELL_POINTS = 4
+# Radii, over that of the field of view, among which rings are chosen, stars on a ring, and light of the full pupil by
+# which pupils of successive rings differ at most, but for single steps.
+_NODE_RADII = np.linspace(0.05, 1.2, 24)
+_NODE_DIRECTIONS = 8
+_DIFFERENT = 0.06
 
 
 class PupilMeans(NamedTuple):
@@ -40,6 +49,7 @@ class PupilMeans(NamedTuple):
     lit: tuple[float, ...]
     #: The same of fields of about as much light, from the darkest on.
     lit_levels: tuple[tuple[float, ...], ...]
+    pupils: FieldPupils | None  #: over the field; None where they are alike
     #: Mean square of the slopes over its mean over the field, as a polynomial over the field: factors of 1, x, y, x^2,
     #: xy, y^2, [6].
     over_field: np.ndarray
@@ -63,8 +73,14 @@ class PupilMeans(NamedTuple):
         aberration = near @ np.einsum("fpi,fqi->pq", slopes, slopes).ravel() / np.maximum(pairs, 1.0)
         squares = (slopes**2).sum(axis=(1, 2)) / np.maximum(lit.sum(axis=1), 1.0)
         over_field = np.linalg.lstsq(_terms(fields), squares / max(squares.mean(), 1e-30), rcond=None)[0]
-        levels = _lit_levels(telescope, inputs.projection, _middle_wavelength(inputs))
-        return cls(tuple(aberration.tolist()), _both_lit(lit, near), levels, over_field)
+        of_light = telescope, inputs.projection, _middle_wavelength(inputs)
+        return cls(
+            tuple(aberration.tolist()),
+            _both_lit(lit, near),
+            _lit_levels(*of_light),
+            _field_pupils(*of_light),
+            over_field,
+        )
 
     def relative_square(self, slopes: np.ndarray) -> np.ndarray:
         """Return the mean square of the slopes at field slopes [n, 2] over its mean over the field, [n]."""
@@ -97,6 +113,44 @@ def _lit_levels(telescope: Telescope, projection: Projection, wavelength: float)
     level = np.where(fraction < _LEAST_LIT, -1, np.searchsorted(_LIT_LEVELS, fraction))
     levels = [_both_lit(lit[level == k].astype(np.float64), near) for k in np.unique(level[level >= 0])]
     return tuple(sorted(levels))
+
+
+@lru_cache(maxsize=16)
+def _field_pupils(telescope: Telescope, projection: Projection, wavelength: float) -> FieldPupils | None:
+    """Return :attr:`PupilMeans.pupils` at a wavelength [m]."""
+    diameter, side = telescope.pupil_diameter, _CELLS * _CELL_POINTS
+    line = diameter * ((np.arange(side) + 0.5) / side - 0.5)
+    points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    distance = np.hypot(*points.T) / (0.5 * diameter)
+    inside = np.flatnonzero((distance < 1.0) & (distance > telescope.pupil_obscuration))
+
+    def light(radius: np.ndarray, directions: int) -> np.ndarray:
+        """Return the light of cells of stars at radii, in each direction, [n_radius, n_direction, side, side]."""
+        angle = 2.0 * np.pi * np.arange(directions) / directions
+        x, y = (radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2).T
+        points_lit = np.zeros((len(x), len(points)))
+        points_lit[:, inside] = lit_points(telescope, field_direction(x, y, projection), wavelength, points[inside], 1)
+        cells = points_lit.reshape(-1, _CELLS, _CELL_POINTS, _CELLS, _CELL_POINTS).mean(axis=(2, 4))
+        return cells.reshape(len(radius), directions, _CELLS, _CELLS)
+
+    radius = np.unique([0.0, *np.minimum(telescope.field_radius * _NODE_RADII, _LARGEST_RADIUS)])
+    samples = light(radius, _DIRECTIONS)
+    area = samples.sum(axis=(2, 3))
+    full = np.zeros(len(points))
+    full[inside] = 1.0
+    full = full.reshape(_CELLS, _CELL_POINTS, _CELLS, _CELL_POINTS).mean(axis=(1, 3))
+    bright = np.flatnonzero((area > _LEAST_LIT * full.sum()).all(axis=1))
+    rings = [0]
+    for ring in bright[1:] if len(bright) and bright[0] == 0 else ():
+        between = np.abs(samples[rings[-1] : ring + 1] - samples[rings[-1]]).sum(axis=(2, 3)).max()
+        if between > _DIFFERENT * full.sum():
+            # The ring before is the last that is like the one chosen, but for a step as long as this.
+            rings.append(ring - 1 if ring - 1 > rings[-1] else ring)
+    if len(rings) == 1:
+        return None
+    radius = radius[np.unique([*rings, bright[-1]])]
+    nodes = light(radius[1:], _NODE_DIRECTIONS).reshape(-1, _CELLS, _CELLS)
+    return FieldPupils(radius, _NODE_DIRECTIONS, diameter, np.concatenate([samples[0, :1], nodes]), full)
 
 
 def _middle_wavelength(inputs: PsfInputs) -> float:

@@ -7,6 +7,8 @@ import pytest
 
 import pachon
 from pachon.models.ideal_telescope import ideal_telescope
+from pachon.raytrace.rays import field_direction
+from pachon.wavefront.psf.clear_pupil import lit_fractions
 from pachon.wavefront.psf.psf import psf_inputs
 from pachon.wavefront.psf.pupil_means import PupilMeans
 from pachon.wavefront.psf.stamps import Stamps
@@ -70,6 +72,21 @@ def test_light_of_a_vignetted_pupil():
     assert (np.diff(levels[:, 0]) > 0.0).all()
     # Of the darkest pupils mostly near pairs are left.
     assert (np.diff(levels[:, 6] / levels[:, 0]) > 0.0).all()
+
+
+def test_pupils_over_the_field_are_those_of_its_stars():
+    """Light of a star between the nodes, by counting rays: HSC loses a third of it, AuxTel none."""
+    hsc = pachon.load_telescope("hsc")
+    inputs, _ = psf_inputs(hsc, [(0.0, 0.0)], [760e-9], None, None, None, Stamps(), 1)
+    pupils = PupilMeans.of(inputs).pupils
+    places = hsc.field_radius * np.array([[0.3, 0.1], [-0.5, 0.6], [0.9, -0.1], [0.0, -0.97]])
+    light = np.einsum("nk,kij->n", pupils.weights(np.tan(places)), pupils.light) / pupils.full.sum()
+    expected = lit_fractions(hsc, field_direction(*np.tan(places).T, "gnomonic"), 760e-9)
+    assert expected[-1] < 0.72
+    np.testing.assert_allclose(light, expected, atol=0.015)
+    auxtel = pachon.load_telescope("auxtel")
+    inputs, _ = psf_inputs(auxtel, [(0.0, 0.0)], [760e-9], None, None, None, Stamps(), 1)
+    assert PupilMeans.of(inputs).pupils is None
 
 
 def test_light_at_the_corners_of_the_camera():
