@@ -68,7 +68,7 @@ _DRAWN = round(_TABLE * _HIGHEST / _LAST)
 #: Distance of stars whose differences tell the amplitude of moments through other pupils, in angles under which the
 #: highest layer crosses the pupil, and its directions.
 _CROSSINGS = 2.0
-_DIRECTIONS = 8
+_DIRECTIONS = 4
 #: Least variance of the differences of stars over that of their moments that is more than rounding.
 _DIFFERENT = 1e-6
 #: Factor of modes without frequency along x, and with the highest one: the inverse transform takes the mean of those at

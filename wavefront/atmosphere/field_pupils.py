@@ -11,7 +11,7 @@ import numpy as np
 class FieldPupils:
     """Pupils of stars on rings about the centre of the field, which is the first; compared by identity."""
 
-    radius: np.ndarray  #: of the rings, rising from zero [rad], [n_ring]
+    radius: np.ndarray  #: field slopes of the rings, rising from zero [rad], [n_ring]
     directions: int  #: of the stars of a ring, evenly from +x
     diameter: float  #: of the entrance pupil, which the grid of cells covers [m]
     #: Lit part of each cell over that of all, [n_node, side, side]: centre, then ring by ring.

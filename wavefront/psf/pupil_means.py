@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import NamedTuple, Self
 
@@ -22,20 +23,18 @@ _POINTS = 72
 _STEPS = 12
 # Fields at which light is looked at, to where corners of cameras reach beyond the field of view: radii over its own,
 # the largest one [rad], directions, and points of the pupil.
-_RADII = np.linspace(0.3, 1.2, 21)
+_RADII = np.linspace(0.0, 1.2, 25)
 _LARGEST_RADIUS = 1.4
 _DIRECTIONS = 4
 _LIGHT_POINTS = 200
-# Lit fractions between which fields are taken together.
-_LIT_LEVELS = np.array([0.15, 0.3, 0.45, 0.6, 0.75, 0.9])
+# Largest step between the lit fractions about which fields are taken together.
+_LIT_STEP = 0.08
 # Pupils of less light are left out.
 _LEAST_LIT = 0.05
 # Cells across the pupils of stars, and rays across a cell.
 _CELLS = 12
 _CELL_POINTS = 4
-# Radii, over that of the field of view, among which rings are chosen, stars on a ring, and light of the full pupil by
-# which pupils of successive rings differ at most, but for single steps.
-_NODE_RADII = np.linspace(0.05, 1.2, 24)
+# Stars on a ring, and light of the full pupil by which pupils of successive rings differ at most, but for single steps.
 _NODE_DIRECTIONS = 8
 _DIFFERENT = 0.06
 
@@ -106,13 +105,24 @@ def _lit_levels(telescope: Telescope, projection: Projection, wavelength: float)
     near = _steps_of_pairs(pupil, telescope.pupil_diameter)
     angle = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    radius = np.minimum(telescope.field_radius * _RADII, _LARGEST_RADIUS)
+    radius = _radii(telescope)
     x, y = (radius[:, None, None] * unit).reshape(-1, 2).T
     lit = lit_points(telescope, field_direction(x, y, projection), wavelength, pupil, 1)
     fraction = lit.mean(axis=1)
-    level = np.where(fraction < _LEAST_LIT, -1, np.searchsorted(_LIT_LEVELS, fraction))
-    levels = [_both_lit(lit[level == k].astype(np.float64), near) for k in np.unique(level[level >= 0])]
+    lit = lit[fraction > _LEAST_LIT]
+    if not len(lit):
+        return ()
+    fraction = lit.mean(axis=1)
+    darkest, brightest = fraction.min(), fraction.max()
+    steps = math.ceil((brightest - darkest) / _LIT_STEP)
+    level = np.rint((fraction - darkest) * (steps / max(brightest - darkest, 1e-9)))
+    levels = [_both_lit(lit[level == k].astype(np.float64), near) for k in np.unique(level)]
     return tuple(sorted(levels))
+
+
+def _radii(telescope: Telescope) -> np.ndarray:
+    """Return the radii of the fields at which light is looked at [rad], from zero."""
+    return np.unique(np.minimum(telescope.field_radius * _RADII, _LARGEST_RADIUS))
 
 
 @lru_cache(maxsize=16)
@@ -133,7 +143,7 @@ def _field_pupils(telescope: Telescope, projection: Projection, wavelength: floa
         cells = points_lit.reshape(-1, _CELLS, _CELL_POINTS, _CELLS, _CELL_POINTS).mean(axis=(2, 4))
         return cells.reshape(len(radius), directions, _CELLS, _CELLS)
 
-    radius = np.unique([0.0, *np.minimum(telescope.field_radius * _NODE_RADII, _LARGEST_RADIUS)])
+    radius = _radii(telescope)
     samples = light(radius, _DIRECTIONS)
     area = samples.sum(axis=(2, 3))
     full = np.zeros(len(points))
@@ -150,7 +160,9 @@ def _field_pupils(telescope: Telescope, projection: Projection, wavelength: floa
         return None
     radius = radius[np.unique([*rings, bright[-1]])]
     nodes = light(radius[1:], _NODE_DIRECTIONS).reshape(-1, _CELLS, _CELLS)
-    return FieldPupils(radius, _NODE_DIRECTIONS, diameter, np.concatenate([samples[0, :1], nodes]), full)
+    direction = field_direction(radius, 0.0 * radius, projection)
+    slope = direction[:, 0] / -direction[:, 2]
+    return FieldPupils(np.abs(slope), _NODE_DIRECTIONS, diameter, np.concatenate([samples[0, :1], nodes]), full)
 
 
 def _middle_wavelength(inputs: PsfInputs) -> float:
