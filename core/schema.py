@@ -7,9 +7,10 @@ expected value. Nothing here is imported with ``import pachon``: pydantic takes 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, ClassVar, Self, TypeVar
+from types import NoneType, UnionType
+from typing import Annotated, Any, ClassVar, Self, TypeVar, Union, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -278,6 +279,24 @@ def known_keys(model: type[BaseModel]) -> tuple[str, ...]:
         else:
             keys.append(key)
     return tuple(keys)
+
+
+def whole_number_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    """Yield the keys of a model whose values are whole numbers, with dots between sections."""
+    for name, field in model.model_fields.items():
+        section, key = field.annotation, f"{prefix}{field.alias or name}"
+        if isinstance(section, type) and issubclass(section, BaseModel):
+            yield from whole_number_keys(section, f"{key}.")
+        elif _is_whole(section):
+            yield key
+
+
+def _is_whole(annotation: Any) -> bool:
+    """Return whether values of a type are whole numbers, or open."""
+    if get_origin(annotation) is Annotated:
+        return _is_whole(get_args(annotation)[0])
+    arms = [arm for arm in get_args(annotation) if arm is not NoneType]
+    return annotation is int or (len(arms) == 1 and get_origin(annotation) in (Union, UnionType) and _is_whole(arms[0]))
 
 
 def key_description(model: type[BaseModel], key: str) -> str:

@@ -71,6 +71,13 @@ def test_values_that_contradict_one_another(tmp_path):
         ("stars: {truth: -1, obsrved: 3}\nband: q\n", "run", ["stars.obsrved", "band", "stars.truth"]),
         ("name: s\nparameters: {}\nmetrics: [fwhm]\ndesign: {kind: grit}\n", "sweep", ["design.kind"]),
         ("name: s\nparameters: {}\nmetrics: [fwhm]\n", "sweep", [None]),
+        (
+            "base: {stars: {truth: -1}, psf: {stmp: 3}}\nparameters: {M2.dz_um: {nominal: 0, range: [0, 9]}}\n",
+            "sweep",
+            ["base.psf.stmp", "base.stars.truth"],
+        ),
+        ("parameters: {M2.dz_um: {nominal: 0, range: [0, 9]}}\nmetrics: [fwhmm]\n", "sweep", [None]),
+        ("parameters: {M9.dz_um: {nominal: 0, range: [0, 9]}}\n", "sweep", [None]),
         ("coatings: {a: {wavelength_nm: [5, 4]}}\nsurfaces: {M1: a}\n", "coatings", ["coatings.a.efficiency"]),
         ("tolerances: [{name: S1.radius_mm, size: 1}]\nloss: 3\n", "tolerances", ["loss"]),
         ("tolerances: [{name: S1.radius_mm, size: 1}]\ndraws: 20\n", "tolerances", []),
