@@ -29,6 +29,10 @@ _LEAST_SIDE = 32
 _MOST_SIDE = 32768
 
 
+#: Keys of a list that say which file and which visits of it are taken: their digest tells the visits.
+SELECTION_KEYS = ("list", "where", "band", "night")
+
+
 class ListSection(Section):
     """List of visits, and which of them are taken."""
 

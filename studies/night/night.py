@@ -20,7 +20,7 @@ from ...pipeline.listed_visit import check_bands, visit_experiment
 from ...pipeline.memory import check_memory
 from ...pipeline.run_folder import CONFIG_NAME
 from ...sky.visit_list.visit_list import ListedVisit, VisitList
-from .config import NightConfig, load_night_configuration
+from .config import SELECTION_KEYS, NightConfig, load_night_configuration
 from .night_files import write_night
 from .sky_pixels import healpix_module
 from .visit_product import VisitProduct, VisitWork, has_ccd_products, product_name
@@ -214,6 +214,6 @@ def claim_night(folder: Path, config: NightConfig, *, resume: bool) -> None:
         now=config.as_dict(),
         read=lambda path: load_night_configuration(path).as_dict(),
         # The digest tells the visits, wherever their file lies now.
-        free_keys=[f"visits.{key}" for key in ("list", "where", "band", "night")],
+        free_keys=[f"visits.{key}" for key in SELECTION_KEYS],
         wanted=resume,
     )

@@ -35,11 +35,13 @@ from ...pipeline.experiment import Experiment
 from ...pipeline.listed_visit import telescope_of_band
 from ...pipeline.resolved_values import require_drawn_stars
 from ...sky.pointing import Pointing
-from ..night.config import ListSection, read_section
+from ..night.config import SELECTION_KEYS, ListSection, read_section
 from .plan import Visit, listed_plan, plan_visits
 
 #: Side of the stamps of the stack [pixel].
 STACK_STAMP = 31
+#: Keys that a list of the same visits may have otherwise.
+LIST_KEYS = tuple(f"visits.from_list.{key}" for key in SELECTION_KEYS)
 #: Side of the stamps of a visit [pixel], of which turned axes cut the corners.
 VISIT_STAMP = 49
 #: Largest distance of a listed pointing from the common one [deg], that of dithers.
@@ -114,6 +116,8 @@ class VisitsConfig(Section):
         visits = self.visits.model_dump(mode="json", exclude={"count", "snapshots"})
         # Default angles are left out, so that products from before these keys stay valid.
         visits = {key: value for key, value in visits.items() if key not in _ANGLES or value != _ANGLES[key]}
+        if self.visits.from_list is not None and self.visits.from_list.digest is not None:
+            visits["from_list"] = self.visits.from_list.digest
         return digest({"run": experiment.config_hash, "ccds": experiment.config.ccds, "visits": visits})
 
     def galaxies_digest(self, experiment: Experiment, **content: Any) -> str:

@@ -22,7 +22,7 @@ from ...core.units import ARCSEC
 from ...pipeline.experiment import Experiment
 from ...pipeline.memory import check_memory
 from ...pipeline.run_folder import CONFIG_NAME, SUMMARY_NAME
-from .config import STACK_STAMP, VisitsConfig, load_visits_configuration
+from .config import LIST_KEYS, STACK_STAMP, VisitsConfig, load_visits_configuration
 from .plan import Visit
 from .plots import correlation_picture, ellipticity_picture
 from .psf_visit import (
@@ -204,7 +204,8 @@ def claim_visits(folder: Path, config: VisitsConfig, *, resume: bool) -> None:
         noun="visits",
         now=plain(config),
         read=lambda path: plain(load_visits_configuration(path)),
-        free_keys=("galaxies", "visits.count", "visits.snapshots"),
+        # The digest tells the visits of a list, wherever its file lies now.
+        free_keys=("galaxies", "visits.count", "visits.snapshots", *LIST_KEYS),
         wanted=resume,
     )
 

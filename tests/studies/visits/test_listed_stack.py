@@ -16,7 +16,7 @@ from pachon.studies.visits.plan import listed_plan
 from pachon.studies.visits.psf_visit import VisitPsfs
 from pachon.studies.visits.stack import PsfSums
 from pachon.studies.visits.visit_figures import VisitFigures
-from pachon.studies.visits.visits import SUMS_NAME, stack_visits
+from pachon.studies.visits.visits import SUMS_NAME, claim_visits, stack_visits
 
 
 @pytest.fixture
@@ -73,6 +73,23 @@ def test_a_list_is_read_once_while_it_stays_the_same(visits_config, list_file, m
     with pytest.raises(ProductError, match="the list has changed"):
         config.plan(1)
     assert len(readings) == 2
+
+
+def test_a_list_that_has_moved_goes_on(visits_config, list_file, tmp_path):
+    """The path of the list made another stack of the same visits; a night went on."""
+    moved = tmp_path / "elsewhere" / "new_name.csv"
+    moved.parent.mkdir()
+    moved.write_text(list_file.read_text())
+    old = visits_config().with_list(ListSection(list=str(list_file), band="r"))
+    new = visits_config().with_list(ListSection(list=str(moved), where="band = 'r'"))
+    other = visits_config().with_list(ListSection(list=str(moved), where="band = 'r' and observationId > 1001"))
+    experiment = old.experiment()
+    assert new.digest(experiment) == old.digest(experiment) != other.digest(experiment)
+    claim_visits(tmp_path / "stack", old, resume=False)
+    claim_visits(tmp_path / "stack", new, resume=True)
+    assert str(moved) in (tmp_path / "stack" / "config.yaml").read_text()
+    with pytest.raises(ProductError, match="holds visits of another configuration"):
+        claim_visits(tmp_path / "stack", other, resume=True)
 
 
 @pytest.mark.long
