@@ -22,6 +22,7 @@ from ...core.units import ARCSEC
 from ...pipeline.experiment import Experiment
 from ...pipeline.memory import check_memory
 from ...pipeline.run_folder import CONFIG_NAME, SUMMARY_NAME
+from ..night.config import read_section
 from .config import LIST_KEYS, STACK_STAMP, VisitsConfig, load_visits_configuration
 from .plan import Visit
 from .plots import correlation_picture, ellipticity_picture
@@ -116,6 +117,9 @@ def stack_visits(
     if config.visits.from_list is not None:
         # A star has one magnitude in all visits.
         visits = tuple(replace(visit, star_limits=magnitude_limits(experiment)) for visit in visits)
+        listed = read_section(config.visits.from_list, config.run)
+        for remark in listed.remarks:
+            execution.reporter.line(f"{listed.source}: {remark}")
     check_rotators(experiment, visits)
     make_folder(folder)
     _check_room(folder, points, len(config.kept))

@@ -8,10 +8,13 @@ from visit_rows import COLUMNS, ROWS
 
 from pachon.core.errors import ConfigError, ProductError
 from pachon.core.long_work import Execution
+from pachon.models.io.bundled import DATA
+from pachon.models.io.site_file import load_site
+from pachon.pipeline.config import Configuration
 from pachon.sky.pointing import Pointing
 from pachon.sky.visit_list.read_list import read_visit_list
 from pachon.studies.night import config as night_config
-from pachon.studies.night.config import ListSection
+from pachon.studies.night.config import ListSection, read_section
 from pachon.studies.visits.plan import listed_plan
 from pachon.studies.visits.psf_visit import VisitPsfs
 from pachon.studies.visits.stack import PsfSums
@@ -115,3 +118,20 @@ def test_a_stack_of_a_list(visits_config, list_file, tmp_path):
     assert sums.max() > 0.0
     for weight in sums:
         assert np.isclose(weight, [0.0, one, two, one + two], rtol=1e-6, atol=0.0).any()
+
+
+def test_the_place_of_a_telescope_without_a_site_is_said(list_file, tmp_path):
+    """It was that of Cerro Pachon without a word; a site of its own file was refused as an unknown one."""
+    text = (DATA / "lsst_v3.3_r.yaml").read_text()
+    (tmp_path / "air.yaml").write_text((DATA / "maunakea.yaml").read_text())
+    assumed = "telescope mine.yaml has no bundled site: place of cerro_pachon is taken"
+    for site, place, scale, remarks in (
+        ("", "cerro_pachon", 25.0, [assumed]),
+        ("site: air.yaml\n", "cerro_pachon", float(load_site("maunakea").outer_scale), [assumed]),
+        ("site: cerro_tololo\n", "cerro_tololo", float(load_site("cerro_tololo").outer_scale), []),
+    ):
+        (tmp_path / "mine.yaml").write_text(site + text)
+        section = ListSection(list=str(list_file), where="observationId = 1004")
+        listed = read_section(section, Configuration(telescope="mine.yaml"), tmp_path)
+        expected = read_visit_list(list_file, where="observationId = 1004", site=place, outer_scale=scale)
+        assert (listed.digest, [*listed.remarks]) == (expected.digest, [*expected.remarks, *remarks])
