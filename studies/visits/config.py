@@ -83,6 +83,8 @@ class VisitsSection(Section):
         return {key: value for key, value in content.items() if key != "from_list" or value is not None}
 
 
+#: Keys of visits that are drawn, which those of a list have themselves.
+_OF_DRAWN = ("count", "dither_deg", "roll_deg", "rotator_deg", "first_epoch")
 _ANGLES = {key: VisitsSection.model_fields[key].default for key in ("roll_deg", "rotator_deg", "rotator_limit_deg")}
 
 
@@ -172,17 +174,22 @@ class VisitsConfig(Section):
     def with_list(self, section: ListSection, folder: Path | None = None) -> VisitsConfig:
         """Return the settings of the visits of a list of one field, whose run has their band, pointing and time.
 
-        The common pointing is that of the run, or the middle of the list.
+        The common pointing is that of the run, or the middle of the list. Relative paths start from `folder`.
 
         Raises
         ------
         PachonError
             If the list cannot be read.
         ConfigError
-            If it has several bands, or pointings more than 5 degrees apart.
+            If it has several bands, or pointings more than 5 degrees apart, or the settings those of visits without a
+            list.
         """
+        begun = self.visits.from_list is not None and self.visits.from_list.digest is not None
+        for key in () if begun else _OF_DRAWN:
+            if getattr(self.visits, key) != VisitsSection.model_fields[key].default:
+                raise ConfigError(f"visits.{key}: expected none with a list, whose visits have their own")
         section = section.model_copy(update={"list": str(((folder or Path()) / str(section.list)).resolve())})
-        listed = read_section(section, self.run)
+        listed = read_section(section, self.run, folder)
         bands = np.unique(listed.band).tolist()
         if len(bands) > 1:
             raise ConfigError(f"{listed.source}: bands {', '.join(bands)}: expected one for a stack, by --band")
