@@ -345,6 +345,9 @@ def test_images_that_lack_something_are_one_line(field, tmp_path, capsys):
         (("--extension", "N4"), "extension = N4: expected one of 0"),
         (("--psf", "x.fits", "--recipe", "paper"), "expected none with --psf"),
         (("--psf", "x.fits", "--model", "focal_plane"), "--psf: expected with --model ccd alone"),
+        (("--gain", "2", "--model", "focal_plane"), "--gain: expected with --model ccd alone"),
+        (("--stars", "x.csv", "--model", "focal_plane"), "--stars: expected with --model ccd alone"),
+        (("--weight-kind", "rms"), "--weight-kind: expected --weight with it"),
     ):
         assert main(["measure", str(tmp_path / "a.fits"), "--quiet", *options]) == 2
         error = capsys.readouterr().err
