@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from visit_rows import COLUMNS, ROWS
 
 import pachon
 from pachon.core.errors import ConfigError
@@ -129,6 +130,25 @@ def test_a_list_makes_visits_a_night(tmp_path):
     assert places(found) == {("line 2", "visits.bands"), ("line 3", "maps.nsid")}
     path.write_text("run: {ccds: [R22]}\nvisits: {count: 3}\n")
     assert pachon.validate_file(path).kind == "visits"
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "problem"),
+    [
+        ("images", "run: {telescope: nosuch}\nimage: {exposures: 2}\n", "unknown telescope 'nosuch'"),
+        ("visits", "run: {ccds: [R99_S11]}\nvisits: {count: 2}\n", "unknown CCD of lsst 'R99_S11'"),
+        ("visits", "visits: {count: 2, roll_deg: [0]}\n", "visits.roll_deg"),
+        ("night", "run: {telescope: comcam_r}\nvisits: {list: list.csv}\n", "band i, 1 visit of list.csv: "),
+        ("align", "visits: 3\ntelescope: nosuch\n", "unknown telescope 'nosuch'"),
+    ],
+)
+def test_names_that_configurations_name(tmp_path, kind, text, problem):
+    """Of runs alone they were looked up: others had no problems, and ended in their commands at once."""
+    (tmp_path / "list.csv").write_text("\n".join([",".join(COLUMNS), ",".join(map(str, ROWS[2]))]))
+    (tmp_path / "file.yaml").write_text(text)
+    found = pachon.validate_file(tmp_path / "file.yaml")
+    assert found.kind == kind
+    assert problem in str(found.problems[0])
 
 
 def test_unknown_files(tmp_path):
