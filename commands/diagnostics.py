@@ -89,8 +89,9 @@ def diagnose_command(
         piff_rows,
     )
 
-    of_stars = {"chip": (chip, None), "x": (x, "x"), "y": (y, "y"), "stamp": (stamp, "stamp")}
-    of_stars |= {"images": (images, None), "min-snr": (min_snr, 20.0), "gain": (gain, 1.0)}
+    of_stars: dict[str, tuple[object, object]] = {"chip": (chip, None), "images": (images, None)}
+    of_stars |= {"x": (x, "x"), "y": (y, "y"), "stamp": (stamp, "stamp")}
+    of_stars |= {"min-snr": (min_snr, 20.0), "gain": (gain, 1.0)}
     stated = [f"--{name}" for name, (value, default) in of_stars.items() if value != default]
     if piff is None and stated:
         raise ConfigError(f"{stated[0]}: expected --piff with it, whose stars the table has")

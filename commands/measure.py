@@ -143,7 +143,13 @@ def measure_command(
     if weight_kind != "weight" and weight is None:
         raise ConfigError("--weight-kind: expected --weight with it")
     # Those that the stars of the focal-plane model would not follow.
-    of_ccd = {"--psf": psf, "--stars": stars, "--extension": extension, "--weight": weight, "--mask": mask}
+    of_ccd: dict[str, object] = {
+        "--psf": psf,
+        "--stars": stars,
+        "--extension": extension,
+        "--weight": weight,
+        "--mask": mask,
+    }
     of_ccd |= {"--gain": gain, "--saturation": saturation}
     stated = [name for name, value in of_ccd.items() if value is not None]
     if model != "ccd" and stated:

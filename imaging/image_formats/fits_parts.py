@@ -99,7 +99,8 @@ def _part_of(index: int, hdu: fits.hdu.base.ExtensionHDU, primary: fits.Header) 
         for card in primary.cards:
             if card.keyword and card.keyword not in header and card.keyword not in ("COMMENT", "HISTORY", "SIMPLE"):
                 header.append(card, end=True)
-    shape = hdu.shape if isinstance(hdu, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)) else ()
+    is_image = isinstance(hdu, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU))
+    shape: tuple[int, ...] = tuple(hdu.shape) if is_image else ()
     while len(shape) > 2 and shape[0] == 1:  # NAXIS3 = 1, as of one frequency or one plane of a cube
         shape = shape[1:]
     # The first files of HSC have EXTTYPE in its place.
@@ -108,4 +109,4 @@ def _part_of(index: int, hdu: fits.hdu.base.ExtensionHDU, primary: fits.Header) 
         header.remove(keyword, ignore_missing=True, remove_all=True)
     # fpack names a nameless image so.
     name = "" if name == "COMPRESSED_IMAGE" else name
-    return FitsPart(index, name, header, tuple(shape), hdu.ver)
+    return FitsPart(index, name, header, shape, hdu.ver)

@@ -178,8 +178,8 @@ def _each_visit_once(columns: ListColumns) -> ListColumns:
         return columns
     merged = columns.rows(~repeats)
     rows_repeat = counted(int(repeats.sum()), "row repeats a visit", "rows repeat visits")
-    taken = counted(len(merged), "visit is", "visits are")
-    merged.remarks.append(f"{rows_repeat} with equal values, as of several proposals: {taken} taken")
+    visits_are = counted(len(merged), "visit is", "visits are")
+    merged.remarks.append(f"{rows_repeat} with equal values, as of several proposals: {visits_are} taken")
     return merged
 
 
@@ -201,12 +201,14 @@ def _visit_numbers(columns: ListColumns) -> np.ndarray:
     if (counts > 1).any():
         twice = unique[counts > 1]
         rows = np.flatnonzero(numbers == twice[0])
-        differing = [columns.source[key] for key, column in columns.values.items() if len(np.unique(column[rows])) > 1]
-        others = f"; they differ in {', '.join(differing)}"
+        differing_columns = [
+            columns.source[key] for key, column in columns.values.items() if len(np.unique(column[rows])) > 1
+        ]
+        reasons = f"; they differ in {', '.join(differing_columns)}"
         if len(twice) > 1:
-            others += f"; {len(twice)} numbers are repeated"
+            reasons += f"; {len(twice)} numbers are repeated"
         raise DomainError(
-            f"{name} = {twice[0]}: {counted(counts[counts > 1][0], 'row')}, expected each visit once{others}", key=name
+            f"{name} = {twice[0]}: {counted(counts[counts > 1][0], 'row')}, expected each visit once{reasons}", key=name
         )
     return numbers
 

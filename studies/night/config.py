@@ -183,7 +183,7 @@ def _air_of(run: Configuration, folder: Path | None) -> tuple[str, float | None,
     if site in BUNDLED:
         return site, outer_scale, ""
     telescope = None if run.telescope is None else load_telescope(from_folder(run.telescope))
-    place = telescope and telescope.site
+    place = None if telescope is None else telescope.site
     if place is None and run.telescope in (None, *TELESCOPES):
         place = _SITE
     if site is None and place not in BUNDLED:

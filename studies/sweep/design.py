@@ -56,7 +56,7 @@ def point_count(sweep: SweepFile) -> int:
             if parameter.values is not None:
                 count *= len(parameter.values)
             else:
-                count *= min(parameter.points or design.points, _whole_count(name, *_ends(parameter)))
+                count *= int(min(parameter.points or design.points, _whole_count(name, *_ends(parameter))))
         return count
     if design.kind in ("one_at_a_time", "table"):
         return len(design_points(sweep))
@@ -83,8 +83,8 @@ def _one_at_a_time(sweep: SweepFile) -> list[Point]:
 
 def _with_whole_numbers(point: Point) -> Point:
     """Return a point with whole numbers as such: a table, a mark or a nominal value may have 3.0."""
-    whole = {name: int(v) for name, v in point.items() if name in whole_keys() and isinstance(v, float) and v % 1 == 0}
-    return {**point, **whole}
+    numbers = {name: v for name, v in point.items() if name in whole_keys() and isinstance(v, float) and v % 1 == 0}
+    return {**point, **{name: int(v) for name, v in numbers.items()}}
 
 
 def _parameter_values(name: str, parameter: SweptParameter, design: Design) -> list[Any]:
