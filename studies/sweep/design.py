@@ -14,7 +14,7 @@ from scipy.stats import norm, qmc
 from ...core.errors import ConfigError
 from ...core.files import parsing, read_bytes, text_lines
 from ...core.random_streams import stream
-from .file import Design, Point, SweepFile, SweptParameter, whole_keys
+from .file import ODD_KEYS, Design, Point, SweepFile, SweptParameter, whole_keys
 
 # Half the width of a normal distribution on a grid, in standard deviations.
 _SIGMAS = 2.0
@@ -96,9 +96,9 @@ def _parameter_values(name: str, parameter: SweptParameter, design: Design) -> l
     if count == 1 and parameter.range is not None:
         return [high]
     if count >= _whole_count(name, low, high):
-        return list(range(_rounded(low), _rounded(high) + 1))
+        return list(range(_rounded(name, low), _rounded(name, high) + 1, _step(name)))
     levels = [float(v) for v in np.linspace(low, high, count)]
-    return levels if name not in whole_keys() else list(dict.fromkeys(map(_rounded, levels)))
+    return levels if name not in whole_keys() else list(dict.fromkeys(_rounded(name, v) for v in levels))
 
 
 def _ends(parameter: SweptParameter) -> tuple[float, float]:
@@ -111,12 +111,19 @@ def _ends(parameter: SweptParameter) -> tuple[float, float]:
 
 def _whole_count(name: str, low: float, high: float) -> float:
     """Return how many whole numbers a parameter of them has between two values; of others without end."""
-    return _rounded(high) - _rounded(low) + 1 if name in whole_keys() else math.inf
+    if name not in whole_keys():
+        return math.inf
+    return (_rounded(name, high) - _rounded(name, low)) // _step(name) + 1
 
 
-def _rounded(value: float) -> int:
-    """Return the nearest whole number; of halves the one above, so that equal steps stay equal."""
-    return math.floor(value + 0.5)
+def _rounded(name: str, value: float) -> int:
+    """Return the nearest value of a key of whole numbers; between two the one above, so that equal steps stay equal."""
+    return 2 * math.floor(0.5 * value) + 1 if name in ODD_KEYS else math.floor(value + 0.5)
+
+
+def _step(name: str) -> int:
+    """Return the distance of two values of a key of whole numbers."""
+    return 2 if name in ODD_KEYS else 1
 
 
 def _unit_cube(design: Design, dimensions: int) -> np.ndarray:
@@ -142,11 +149,12 @@ def _quantiles(name: str, parameter: SweptParameter, u: np.ndarray) -> list[Any]
         low, high = parameter.range
         if name in whole_keys():
             # Both ends are as likely as the others.
-            return [min(math.floor(low + (high - low + 1.0) * v), int(high)) for v in u]
+            count, step = _whole_count(name, low, high), _step(name)
+            return [min(int(low) + step * math.floor(count * v), int(high)) for v in u]
         return [float(v) for v in low + (high - low) * u]
     mean, sigma = parameter.normal or (0.0, 0.0)
     values = [float(v) for v in mean + sigma * norm.ppf(u)]
-    return values if name not in whole_keys() else [_rounded(v) for v in values]
+    return values if name not in whole_keys() else [_rounded(name, v) for v in values]
 
 
 def _from_table(path: Path) -> list[Point]:

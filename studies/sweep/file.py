@@ -83,6 +83,10 @@ class Design(Section):
     )
 
 
+#: Keys of the configuration whose whole numbers are odd.
+ODD_KEYS = frozenset({"psf.stamp"})
+
+
 @cache
 def whole_keys() -> frozenset[str]:
     """Return the keys of the configuration whose values are whole numbers."""
@@ -193,8 +197,9 @@ def _check(sweep: SweepFile) -> None:
             stated = {f"range[{i}]": end for i, end in enumerate(parameter.range or ())}
             stated |= {f"marks.{mark}": value for mark, value in parameter.marks.items()}
             for key, value in stated.items():
-                if value % 1.0:
-                    raise ConfigError(f"{place}.{key} = {value:g}: expected a whole number")
+                if value % 1.0 or (name in ODD_KEYS and value % 2.0 == 0.0):
+                    expected = "an odd number" if name in ODD_KEYS else "a whole number"
+                    raise ConfigError(f"{place}.{key} = {value:g}: expected {expected}")
         if parameter.normal is not None and not parameter.normal[1] > 0:
             raise ConfigError(f"{place}.normal = {list(parameter.normal)}: expected a standard deviation above 0")
         if parameter.nominal is None and sweep.design.kind == "one_at_a_time":

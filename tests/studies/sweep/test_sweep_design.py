@@ -85,6 +85,18 @@ def test_random_whole_numbers_are_evenly_likely(kind):
     assert counts.std() == pytest.approx(np.sqrt(4 + 1 / 12), rel=0.15)
 
 
+@pytest.mark.parametrize("kind", ["grid", "one_at_a_time", "latin_hypercube"])
+def test_sides_of_stamps_are_odd(kind):
+    """Half of the points had even ones, which are refused."""
+    parameters = {"psf.stamp": {"nominal": 41, "range": [31, 51]}}
+    stamps = [point["psf.stamp"] for point in design_points(sweep(kind, parameters, points=7))]
+    assert (min(stamps), max(stamps)) == (31, 51)
+    assert {stamp % 2 for stamp in stamps} == {1}
+    assert point_count(sweep("grid", parameters, points=99)) == 11
+    with pytest.raises(ConfigError, match=r"parameters.psf.stamp.range\[1\] = 50: expected an odd number"):
+        sweep(kind, {"psf.stamp": {"nominal": 41, "range": [31, 50]}})
+
+
 def test_nominal_values_and_marks_of_whole_numbers(tmp_path):
     parameters = {"psf.stamp": {"nominal": 41.0, "values": [31.0, 51], "marks": {"wide": 61}}}
     stamps = [p["psf.stamp"] for p in design_points(sweep("one_at_a_time", parameters))]
