@@ -62,11 +62,16 @@ def read_columns(path: Path) -> dict[str, Column | np.ndarray]:
                     name: _with_unit(columns[heading], unit)
                     for name, (heading, unit) in _names_in_headings(columns).items()
                 }
-            if kind == "fits":
-                table = Table.read(io.BytesIO(data), format=kind, astropy_native=True)
-            else:
-                table = text_table(data, kind)
+            table = _fits_table(data) if kind == "fits" else text_table(data, kind)
         return {key: table[name] for key, name in names_in_small_letters(table.colnames).items()}
+
+
+def _fits_table(data: bytes) -> Table:
+    """Return the first table of a FITS file, with its times unless they are in a scale beyond the standard."""
+    try:
+        return Table.read(io.BytesIO(data), format="fits", astropy_native=True)
+    except (ValueError, AssertionError):  # astropy asserts that it knows the scale
+        return Table.read(io.BytesIO(data), format="fits")
 
 
 def names_in_small_letters(names: Iterable[str]) -> dict[str, str]:
