@@ -160,6 +160,15 @@ def _visits_of(
     return replace(visits, remarks=(*visits.remarks, remark)) if remark else visits
 
 
+def require_same_list(folder: Path, noun: str, before: ListSection | None, now: ListSection | None) -> None:
+    """Raise ProductError where a folder holds something of other visits than those that are wanted now."""
+    if before is not None and now is not None and before.digest != now.digest:
+        raise ProductError(
+            f"{folder} holds {noun} of another list: {now.list} has changed, or other visits of it are taken; choose "
+            "another --out"
+        )
+
+
 def _state_of(path: Path) -> tuple[int, int] | None:
     """Return time and size of a file, which change with its content; None where there is none."""
     try:

@@ -92,7 +92,7 @@ def test_a_list_that_has_moved_goes_on(visits_config, list_file, tmp_path):
     claim_visits(tmp_path / "stack", old, resume=False)
     claim_visits(tmp_path / "stack", new, resume=True)
     assert str(moved) in (tmp_path / "stack" / "config.yaml").read_text()
-    with pytest.raises(ProductError, match="holds visits of another configuration"):
+    with pytest.raises(ProductError, match=r"stack holds visits of another list: .*new_name.csv has changed, or other"):
         claim_visits(tmp_path / "stack", other, resume=True)
 
 
