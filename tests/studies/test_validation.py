@@ -151,6 +151,26 @@ def test_names_that_configurations_name(tmp_path, kind, text, problem):
     assert problem in str(found.problems[0])
 
 
+@pytest.mark.parametrize(
+    ("text", "problems"),
+    [
+        ("visits: {roll_deg: 5}\n", ["visits.roll_deg = 5: expected one of random, or a list"]),
+        ("visits: {roll_deg: [a]}\n", ['visits.roll_deg[0] = "a": expected a number']),
+        ("base: 5\nparameters: {}\n", ["base = 5: expected a mapping of keys to values, or a text"]),
+        (
+            "name: c\nsource: s\npixel_um: 15\npixels: [9, 9]\nccds: [{name: A, x_mm: 0, y_mm: 0}]\nphotometry: 3\n",
+            ["photometry = 3: expected one of lsst, or a mapping of keys to values"],
+        ),
+    ],
+)
+def test_values_of_several_types_have_one_problem(tmp_path, text, problems):
+    """Each type had one, under its name in pydantic: visits.roll_deg.tuple[function-after[forbid_inf..."""
+    (tmp_path / "file.yaml").write_text(text)
+    found = pachon.validate_file(tmp_path / "file.yaml").problems
+    assert [problem.problem for problem in found] == problems
+    assert all(problem.place for problem in found)
+
+
 def test_unknown_files(tmp_path):
     for name, text in (("a.docx", "x"), ("b.yaml", "colour: red\n")):
         (tmp_path / name).write_text(text)
