@@ -65,7 +65,7 @@ def camera_command(
     from ..core.files import write_bytes
     from ..core.plotting import picture_bytes
 
-    kind = picture_kind(picture)
+    kind = picture_kind(picture, no_picture)
     drawn = not no_picture and (picture is not None or not as_json)
     camera = _listed_camera(heights)
     if settings and Path(heights).suffix.lower() not in YAML:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
+from ..core.errors import ConfigError
 from ..core.number_text import counted
 from ..core.terminal import print_line
 from . import completion
@@ -88,6 +89,14 @@ def diagnose_command(
         piff_rows,
     )
 
+    of_stars: dict[str, tuple[object, object]] = {"chip": (chip, None), "images": (images, None)}
+    of_stars |= {"x": (x, "x"), "y": (y, "y"), "stamp": (stamp, "stamp")}
+    of_stars |= {"min-snr": (min_snr, 20.0), "gain": (gain, 1.0)}
+    stated = [f"--{name}" for name, (value, default) in of_stars.items() if value != default]
+    if piff is None and stated:
+        raise ConfigError(f"{stated[0]}: expected --piff with it, whose stars the table has")
+    if piff is not None and strict:
+        raise ConfigError("--strict with --piff: expected none, a table of stars has no CCDs")
     if piff is not None:
         columns = {"x": x, "y": y, "stamp": stamp, "images": images}
         options = {"chip": chip, "min_snr": min_snr, "gain": gain}

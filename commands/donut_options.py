@@ -383,7 +383,7 @@ class OutputOptions:
         from ..core.files import require_writable
         from ..core.table_files import FORMATS
 
-        kind = picture_kind(self.picture_path)
+        kind = picture_kind(self.picture, self.no_picture)
         if self.out is not None and self.out.suffix.lower() not in FORMATS:
             raise ConfigError(f"--out = {self.out}: expected a name that ends in {', '.join(FORMATS)}")
         if self.out is not None:

@@ -140,8 +140,20 @@ def measure_command(
     from ..imaging.image_formats.load import ImageSettings
     from ..imaging.measure_files import MeasureOptions, images_among, measure_files
 
-    if model != "ccd" and psf is not None:
-        raise ConfigError("--psf: expected with --model ccd alone")
+    if weight_kind != "weight" and weight is None:
+        raise ConfigError("--weight-kind: expected --weight with it")
+    # Those that the stars of the focal-plane model would not follow.
+    of_ccd: dict[str, object] = {
+        "--psf": psf,
+        "--stars": stars,
+        "--extension": extension,
+        "--weight": weight,
+        "--mask": mask,
+    }
+    of_ccd |= {"--gain": gain, "--saturation": saturation}
+    stated = [name for name, value in of_ccd.items() if value is not None]
+    if model != "ccd" and stated:
+        raise ConfigError(f"{stated[0]}: expected with --model ccd alone")
     if model == "ccd" and telescope is not None:
         raise ConfigError("--telescope: expected with --model focal_plane alone")
     if out is not None:

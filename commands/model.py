@@ -111,7 +111,7 @@ def model_command(
     from ..reconstruction.own_stars.result import with_left_out
     from ..reconstruction.own_stars.star_catalogue import FLAG_MASK, load_stars
 
-    kind = picture_kind(picture)
+    kind = picture_kind(picture, no_picture)
     chosen_recipe = recipe_of_options(recipe, basis, interpolation, components, weights, order)
     options: dict[str, Any] = {} if chosen_recipe is None else {"recipe": chosen_recipe}
     path = stars.with_name(f"{stars.stem}_psf.fits") if out is None else out

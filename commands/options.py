@@ -227,8 +227,10 @@ def wavelength_list(
     return np.array(wavelengths_nm) * 1e-9 if wavelengths_nm else None
 
 
-def picture_kind(picture: Path | None) -> str:
+def picture_kind(picture: Path | None, no_picture: bool = False) -> str:
     """Return the format of a picture by the end of its name; png where there is no name."""
+    if picture is not None and no_picture:
+        raise ConfigError("--picture and --no-picture: expected one of them")
     kind = "png" if picture is None else picture.suffix.lower().removeprefix(".")
     if kind not in ("png", "pdf", "svg"):
         raise ConfigError(f"--picture = {picture}: expected a name that ends in .png, .pdf or .svg")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 from typer import Argument
 
-from ..core.errors import PrescriptionWarning
+from ..core.errors import ConfigError, PrescriptionWarning
 from ..core.number_text import counted
 from ..core.terminal import print_line
 from . import completion
@@ -51,6 +51,9 @@ def info_command(
     - `pachon info my_telescope.yaml --json`
     """
     console = wide_console()
+    of_model = {"--glass-catalogue": glass_catalogue, "--lenient": lenient, "--configuration": configuration}
+    if model is None and (stated := [name for name, value in of_model.items() if value]):
+        raise ConfigError(f"{stated[0]}: expected MODEL with it")
     if model is None:
         from ..models.io.bundled import bundled_models
 

@@ -177,10 +177,15 @@ def visits_command(
         visits__roll_deg=angles_of("--roll", roll),
         visits__rotator_deg=angles_of("--rotator", rotator),
     )
-    if stack:
-        section = ListSection(list=str(visit_list), where=where, band=band, night=night)
-        visits_config = visits_config.with_list(section)
-    experiment = visits_config.experiment(None if config is None else config.parent)
+    folder = None if config is None else config.parent
+    named_list = visits_config.visits.from_list
+    if visit_list is not None:
+        listed = ListSection(list=str(visit_list.absolute()), where=where, band=band, night=night)
+        visits_config = visits_config.with_list(listed, folder)
+    elif named_list is not None and named_list.digest is None:
+        # Written by hand; that of a stack that was begun has all that follows from its list.
+        visits_config = visits_config.with_list(named_list, folder)
+    experiment = visits_config.experiment(folder)
     hint = f"finished visits are in {out}, and --resume goes on from there"
     with long_work(
         quiet, hint, threads=threads, resume=resume, processes=processes, scheduler=scheduler, dask=workers

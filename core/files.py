@@ -25,6 +25,8 @@ from .errors import PachonError, ProductError, cut_short
 
 # Size of the file that probes for free space [byte].
 _PROBE = 4096
+#: Key of a configuration among results.
+_CONFIGURATION = "configuration"
 
 
 def write_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError) -> None:
@@ -267,10 +269,11 @@ def json_text(content: Any) -> str:
 def plain_values(value: Any, digits: int | None = 9) -> Any:
     """Return a value for JSON: lists for arrays, None for numbers that are not finite, rounded to `digits` if given.
 
-    Nine digits are enough, and equal on machines whose sums differ in the last bits.
+    Nine digits are enough, and equal on machines whose sums differ in the last bits. A configuration keeps its own, of
+    which a date has more.
     """
     if isinstance(value, dict):
-        return {str(k): plain_values(v, digits) for k, v in value.items()}
+        return {str(k): plain_values(v, None if k == _CONFIGURATION else digits) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain_values(v, digits) for v in value]
     if isinstance(value, np.ndarray):

@@ -7,9 +7,11 @@ expected value. Nothing here is imported with ``import pachon``: pydantic takes 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, ClassVar, Self, TypeVar
+from types import NoneType, UnionType
+from typing import Annotated, Any, ClassVar, Self, TypeVar, Union, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -92,7 +94,7 @@ def validated(
             return model.model_validate(content, context=context)
         except ValidationError as problems:
             # A misspelt key is the likelier cause of the other problems, so it goes first.
-            errors = problems.errors(include_url=False)
+            errors = _of_unions(problems.errors(include_url=False), content)
             first = min(errors, key=lambda p: p["type"] != "unknown_key")
             first_error = _one_line_error(first, content, source, error, others=errors, model=model)
             if drop is None or first["type"] != "unknown_key":
@@ -114,7 +116,7 @@ def problems_of(
             # Validators write into the context.
             model.model_validate(content, context=None if context is None else dict(context))
         except ValidationError as problems:
-            errors = problems.errors(include_url=False)
+            errors = _of_unions(problems.errors(include_url=False), content)
             unknown = [p for p in errors if p["type"] == "unknown_key"]
             all_errors += [_one_line_error(p, content, source, error, model=model) for p in unknown or errors]
             for unknown_problem in unknown:
@@ -280,6 +282,24 @@ def known_keys(model: type[BaseModel]) -> tuple[str, ...]:
     return tuple(keys)
 
 
+def whole_number_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    """Yield the keys of a model whose values are whole numbers, with dots between sections."""
+    for name, field in model.model_fields.items():
+        section, key = field.annotation, f"{prefix}{field.alias or name}"
+        if isinstance(section, type) and issubclass(section, BaseModel):
+            yield from whole_number_keys(section, f"{key}.")
+        elif _is_whole(section):
+            yield key
+
+
+def _is_whole(annotation: Any) -> bool:
+    """Return whether values of a type are whole numbers, or open."""
+    if get_origin(annotation) is Annotated:
+        return _is_whole(get_args(annotation)[0])
+    arms = [arm for arm in get_args(annotation) if arm is not NoneType]
+    return annotation is int or (len(arms) == 1 and get_origin(annotation) in (Union, UnionType) and _is_whole(arms[0]))
+
+
 def key_description(model: type[BaseModel], key: str) -> str:
     """Return the description of a key of a model, with dots between sections; empty where there is none."""
     first, _, inner_key = key.partition(".")
@@ -350,16 +370,62 @@ def _one_line_error(
         also = [key for key in dict.fromkeys(_missing_key(p, content) for p in others) if key not in ("", path)]
         also_text = ", ".join(also[:8] + ["..."] * (len(also) > 8))
         return error(f"{path} is missing" + (f"; also {also_text}" if also else ""), file=source, key=path)
-    if kind == "expected":
-        text = limits["expected"]
-    elif kind == "literal_error":
-        text = one_of(str(limits["expected"]).replace(" or ", ", ").replace("'", "").split(", "), value)
-    elif kind in _LIMITS:
-        name, word = _LIMITS[kind]
-        text = f"a number {word} {limits[name]:g}"
-    else:
-        text = _EXPECTED.get(kind, problem["msg"])
+    text = _expected_text(kind, limits, value, problem["msg"])
     return error(f"{path} = {_value_text(error, value)}: expected {text}", file=source, key=path)
+
+
+def _expected_text(kind: str, limits: Mapping[str, Any], value: Any, message: str) -> str:
+    """Return what was expected in place of a value, by the kind of its problem."""
+    if kind == "expected":
+        return str(limits["expected"])
+    if kind == "literal_error":
+        return one_of(str(limits["expected"]).replace(" or ", ", ").replace("'", "").split(", "), value)
+    if kind in _LIMITS:
+        name, word = _LIMITS[kind]
+        return f"a number {word} {limits[name]:g}"
+    return _EXPECTED.get(kind, message)
+
+
+#: Names of types in the locations of pydantic: tuple[float, ...], literal['random'], str, PhotometrySection.
+_TYPE_NAME = re.compile(r".*[\[(].*|str|int|float|bool|\w+Section")
+
+
+def _of_unions(errors: Iterable[Any], content: Any) -> list[Any]:
+    """Return the problems with those of each value that may be of several types as one, or as those deepest in it."""
+    places = [(_union_place(problem, content), problem) for problem in errors]
+    merged: list[Any] = []
+    done = set()
+    for place, problem in places:
+        if place is None:
+            merged.append(problem)
+        elif place not in done:
+            done.add(place)
+            of_value = [p for other_place, p in places if other_place == place]
+            depth = max(len(p["loc"]) for p in of_value)
+            if depth > len(place) + 1:
+                merged += [
+                    p | {"loc": (*place, *p["loc"][len(place) + 1 :])} for p in of_value if len(p["loc"]) == depth
+                ]
+                continue
+            value = problem["input"]
+            texts = [_expected_text(p["type"], p.get("ctx", {}), value, p["msg"]) for p in of_value]
+            text = ", or ".join(dict.fromkeys(texts))
+            merged.append(problem | {"type": "expected", "loc": place, "ctx": {"expected": text}})
+    return merged
+
+
+def _union_place(problem: Mapping[str, Any], content: Any) -> tuple[int | str, ...] | None:
+    """Return the location of the value that a problem is of, with the name of a type behind it; None of others."""
+    location = problem["loc"]
+    for depth, component in enumerate(location):
+        if isinstance(component, str) and component.startswith("<"):
+            continue
+        try:
+            content = content[component]
+        except (LookupError, TypeError):
+            is_type = isinstance(component, str) and _TYPE_NAME.fullmatch(component)
+            return tuple(location[:depth]) if is_type else None
+    return None
 
 
 def _value_text(error: type[PachonError], value: Any) -> str:

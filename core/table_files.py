@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -17,7 +17,7 @@ from astropy.table import Column, MaskedColumn, Table
 from astropy.table.meta import get_header_from_yaml
 from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
-from .errors import ConfigError, PachonError, ProductError
+from .errors import ConfigError, PachonError, ProductError, error_context
 from .files import parsing, read_bytes, text_lines, write_bytes
 from .products import Card, Columns, card_text, card_value
 from .units import metres, pure_numbers, radians
@@ -38,18 +38,21 @@ def read_columns(path: Path) -> dict[str, Column | np.ndarray]:
     """Return the columns of a file, of FITS its first table, by their names in small letters.
 
     Names with units, of CSV and Parquet, stand for their columns beside the names alone, whose columns have the units.
+    Of names that differ in capitals only, as ``R`` and ``r`` of magnitudes, all but that in small letters stay as they
+    are. Columns of times by the FITS standard are those of astropy.
 
     Raises
     ------
     ProductError
-        If the file has another ending, cannot be read or is damaged, or pyarrow is missing.
+        If the file has another ending, cannot be read or is damaged, pyarrow is missing, or several columns have one
+        name but for capitals, and none is in small letters.
     """
     ending = path.suffix.lower()
     if ending not in ENDINGS:
         raise ProductError(f"ending {path.suffix!r}: expected one of {', '.join(ENDINGS)}", file=path)
     kind = FORMATS.get(ending, "fits")
     data = read_bytes(path, ProductError)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), error_context(file=path):
         warnings.simplefilter("ignore", AstropyWarning)
         with parsing(path, f"damaged or no {kind.removeprefix('ascii.').upper()} table", ProductError):
             if kind == "parquet":
@@ -59,8 +62,37 @@ def read_columns(path: Path) -> dict[str, Column | np.ndarray]:
                     name: _with_unit(columns[heading], unit)
                     for name, (heading, unit) in _names_in_headings(columns).items()
                 }
-            table = Table.read(io.BytesIO(data), format=kind) if kind == "fits" else text_table(data, kind)
-    return {name.lower(): table[name] for name in table.colnames}
+            table = _fits_table(data) if kind == "fits" else text_table(data, kind)
+        return {key: table[name] for key, name in names_in_small_letters(table.colnames).items()}
+
+
+def _fits_table(data: bytes) -> Table:
+    """Return the first table of a FITS file, with its times unless they are in a scale beyond the standard."""
+    try:
+        return Table.read(io.BytesIO(data), format="fits", astropy_native=True)
+    except (ValueError, AssertionError):  # astropy asserts that it knows the scale
+        return Table.read(io.BytesIO(data), format="fits")
+
+
+def names_in_small_letters(names: Iterable[str]) -> dict[str, str]:
+    """Return the names of columns by these names in small letters.
+
+    Where a name in small letters is that of a column, others that differ from it in capitals only stand under their
+    own.
+
+    Raises
+    ------
+    ProductError
+        If names differ in capitals only, and none is in small letters.
+    """
+    all_names = dict.fromkeys(map(str, names))
+    by_key: dict[str, str] = {}
+    for name in all_names:
+        key = name if name.lower() in all_names else name.lower()
+        if key in by_key:
+            raise ProductError(f"columns {by_key[key]} and {name}: expected names that differ in more than capitals")
+        by_key[key] = name
+    return by_key
 
 
 def column_in_unit(columns: Mapping[str, Any] | Table, name: str, unit: u.UnitBase | None) -> np.ndarray:
@@ -93,14 +125,14 @@ def _parquet_columns(content: Any) -> dict[str, Column | np.ndarray]:
     units, columns = _parquet_units(content.schema), {}
     # astropy writes the mask of a column as another column.
     masks = {f"{name}.mask" for name in content.column_names}.intersection(content.column_names)
-    for name in content.column_names:
+    for key, name in names_in_small_letters(content.column_names).items():
         values = content[name].to_numpy()
         if f"{name}.mask" in masks:
             values = MaskedColumn(values, mask=content[f"{name}.mask"].to_numpy())
         if name in units:
             values = _with_unit(values, u.Unit(units[name], parse_strict="silent"))
         if name not in masks:
-            columns[name.lower()] = values
+            columns[key] = values
     return columns
 
 

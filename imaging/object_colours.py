@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ..core.arguments import check_arguments
-from ..core.errors import DomainError, ProductError
+from ..core.errors import DomainError, ProductError, error_context
+from ..core.table_files import names_in_small_letters
 from ..models.star_spectrum import psf_colours
 from .image_file import CcdImage
 from .star_positions import positions_in, table_in
@@ -74,10 +75,12 @@ def read_object_colours(path: Path, column: str, image: CcdImage) -> ObjectColou
         positions, and the image no world coordinates.
     """
     table = table_in(path)
-    names = {name.lower(): name for name in table.colnames}
-    if column.lower() not in names:
+    with error_context(file=path):
+        names = names_in_small_letters(table.colnames)
+    name = names.get(column) or names.get(column.lower())
+    if name is None:
         raise ProductError(f"no column {column!r}; its columns are {', '.join(table.colnames)}", file=path)
-    values = np.ma.asarray(table[names[column.lower()]])
+    values = np.ma.asarray(table[name])
     if values.dtype.kind not in "fiu" or values.ndim != 1:
         raise ProductError(f"column {column!r} has type {values.dtype}: expected a number in every row", file=path)
     colours = np.ma.filled(values.astype(float), np.nan)

@@ -13,7 +13,7 @@ from astropy.table import Table
 from ..core.errors import DomainError, ProductError, error_context
 from ..core.files import parsing, read_bytes
 from ..core.fits_files import open_fits
-from ..core.table_files import column_in_unit, text_table
+from ..core.table_files import column_in_unit, names_in_small_letters, text_table
 from .image_file import CcdImage
 
 #: Columns of pixels, the first one's centre at (0, 0), in small letters.
@@ -51,7 +51,8 @@ def read_star_positions(path: Path, image: CcdImage) -> np.ndarray:
 
 def positions_in(table: Table, image: CcdImage, path: Path) -> np.ndarray:
     """Return the pixels of an image at which the rows of a table of a file are, [n, 2]; ProductError without any."""
-    columns = {name.lower(): name for name in table.colnames}
+    with error_context(file=path):
+        columns = names_in_small_letters(table.colnames)
 
     def values(names: tuple[str, str], unit: u.UnitBase | None = None) -> np.ndarray:
         with error_context(file=path):

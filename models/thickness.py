@@ -43,26 +43,36 @@ def front_surface(telescope: Telescope, target: str) -> int:
 def light_axis(telescope: Telescope, index: int) -> np.ndarray:
     """Return the unit vector along the axis of a surface in the direction of the light behind it, shape [3].
 
-    Light comes along -z of the first surface, and each mirror turns it back. Behind a fold mirror, whose own axis is
-    that of nothing, it is the axis in front of it after reflection, where the next vertex lies on that.
+    Light comes along -z of the first surface, and each mirror turns it back. Behind a fold mirror or a tilted plate,
+    whose own axis is that of nothing, it is the axis in front of it, after reflection by a mirror, where the next
+    vertex lies on that.
     """
     surface, following = telescope.surfaces[index], telescope.surfaces[index + 1 :]
     mirrors = sum(s.interaction == Interaction.MIRROR for s in telescope.surfaces[: index + 1])
     axis: np.ndarray = surface.matrix[:, 2]
     axis = axis if mirrors % 2 else -axis
-    if surface.interaction != Interaction.MIRROR:
-        return axis
     offsets = (np.subtract(s.vertex, surface.vertex) for s in following)
     ahead = next((offset for offset in offsets if offset.any()), axis)
     aside = _distance_from(axis, ahead)
     if aside == 0.0:
         return axis
+    if surface.interaction != Interaction.MIRROR:
+        # A plate is tilted in the light that the surfaces in front of it have led there.
+        earlier = telescope.surfaces[:index]
+        otherwise = [i for i, s in enumerate(earlier) if not np.array_equal(s.matrix[:, 2], surface.matrix[:, 2])]
+        incoming_axis = _light_axis_at(telescope, otherwise[-1] if otherwise else -1)
+        return incoming_axis if _distance_from(incoming_axis, ahead) < _OF_FOLDS * aside else axis
     # A lens may stand in the light that a grating has turned, a tilted plate may not: the mirror in front of it tells.
     front_mirrors = (i for i in range(index)[::-1] if telescope.surfaces[i].interaction == Interaction.MIRROR)
     lights = {index - 1, next(front_mirrors, -1)}
-    incoming = (light_axis(telescope, i) if i >= 0 else np.array([0.0, 0.0, -1.0]) for i in sorted(lights))
+    incoming = (_light_axis_at(telescope, i) for i in sorted(lights))
     reflected = min((v - 2.0 * (v @ axis) * axis for v in incoming), key=lambda v: _distance_from(v, ahead))
     return reflected if _distance_from(reflected, ahead) < _OF_FOLDS * aside else axis
+
+
+def _light_axis_at(telescope: Telescope, index: int) -> np.ndarray:
+    """Return :func:`light_axis`; that of the light in front of the telescope for -1."""
+    return light_axis(telescope, index) if index >= 0 else np.array([0.0, 0.0, -1.0])
 
 
 def is_fold(telescope: Telescope, index: int) -> bool:

@@ -104,8 +104,8 @@ def visit_experiment(config: Configuration, visit: ListedVisit, folder: Path | N
         settings = experiment.config
         band = experiment.band
         updates = {
-            "read_noise_e": band.read_noise * math.sqrt(visit.snaps),
-            "full_well_e": band.full_well * visit.snaps,
+            "read_noise_e": band.read_noise * math.sqrt(visit.snaps / _snaps_within(config, "read_noise_e")),
+            "full_well_e": band.full_well * visit.snaps / _snaps_within(config, "full_well_e"),
         }
         if math.isfinite(visit.sky):
             updates["dark_sky"] = visit.sky
@@ -117,6 +117,11 @@ def visit_experiment(config: Configuration, visit: ListedVisit, folder: Path | N
             stars = settings.stars.model_copy(update=limits)
             return Experiment.from_config(settings.model_copy(update={"stars": stars}))
         return replace(experiment, config=settings)
+
+
+def _snaps_within(config: Configuration, key: str) -> int:
+    """Return the snaps that a number of the photometry is of: several in the configuration of a visit of a list."""
+    return 1 if config.visit is None or getattr(config.photometry, key) is None else config.visit.snaps
 
 
 def check_bands(config: Configuration, visits: VisitList, folder: Path | None = None) -> None:

@@ -248,9 +248,9 @@ def _landing_points(telescope: Telescope, slopes: np.ndarray, wavelength: float)
 
 
 def _column_names(key: str, columns: dict[str, str], band: str) -> tuple[str, ...]:
-    """Return the names that a column may have, in small letters."""
+    """Return the names that a column may have: one that is given, as it is, and in small letters."""
     if key in columns:
-        return (columns[key].lower(),)
+        return tuple(dict.fromkeys((columns[key], columns[key].lower())))
     return tuple(name.format(band=band) for name in NAMES[key])
 
 

@@ -25,6 +25,7 @@ from ..core.errors import ProductError
 from ..core.files import parsing, require_file
 from ..core.fits_files import open_fits
 from ..core.mask_planes import bad_bits
+from ..core.noise_planes import MASK_NAMES, NoiseKind, noise_kind
 from ..core.number_text import counted
 from ..core.table_files import text_table
 from .inputs import SMALLEST_STAMP
@@ -39,15 +40,8 @@ from .stamp_headers import (
     stamp_header,
 )
 
-#: Kinds of planes that go with images, by the names of their extensions without numbers.
-_PLANES = {
-    "mask": r"MASK|MSK|DQ|QUALITY|FLAGS|BPM",
-    "variance": r"VARIANCE|VAR",
-    "weight": r"WEIGHT|WGT|WHT|WTMAP|IVAR|INVVAR",
-    "deviation": r"ERR|ERROR|SIGMA|STDDEV|UNCERT",
-}
-#: Kinds of extensions UNCERT of astropy's CCDData by their keyword UTYPE; standard deviations without one.
-_UNCERTAINTIES = {"VarianceUncertainty": "variance", "InverseVariance": "weight"}
+#: Numbers behind the names of extensions of planes, as in VARIANCE_2.
+_NUMBER = re.compile(r"[_ ]?\d*$")
 #: Units of the columns that make a table one of stamps or positions; those of columns with other units are converted.
 _COLUMNS = {"field_x": u.deg, "field_y": u.deg, "x": u.pixel, "y": u.pixel, "defocus_um": u.um}
 
@@ -107,6 +101,13 @@ class _Image:
     variance: np.ndarray | None
     header: fits.Header
 
+    def plane(self) -> _Image:
+        """Return the only image of a cube of one, or the image as it is."""
+        if self.data.ndim != 3 or len(self.data) != 1:
+            return self
+        variance = None if self.variance is None else self.variance[0]
+        return _Image(self.data[0], self.mask[0], variance, self.header)
+
 
 def read_stamps(
     path: Path,
@@ -163,6 +164,8 @@ def _stamps_of(
     values = header_values([image.header for image in images], path)
     named = [str(image.header["MOVED"]).strip() for image in images if "MOVED" in image.header]
     moved = one_body([*named, *(_texts(table, "moved") if table is not None else ())], path)
+    if len(images) == 1 and table is not None and {"x", "y"} <= _names(table) and len(table) != 1:
+        images = [images[0].plane()]
     if len(images) == 1 and images[0].data.ndim == 2 and table is not None and {"x", "y"} <= _names(table):
         return replace(_cut_stamps(images[0], table, size, positions or path, values, path), moved=moved)
     single = [stamp for image in images for stamp in _split(image)]
@@ -233,7 +236,10 @@ def _units(path: Path) -> list[tuple[fits.Header, np.ndarray | Table | None]]:
     with parsing(path, "cannot be read as FITS", ProductError), open_fits(path, ProductError, memmap=False) as units:
         for unit in units:
             if unit.is_image:
-                contents.append((unit.header, None if unit.data is None else np.asarray(unit.data)))
+                data = None if unit.data is None else np.asarray(unit.data)
+                while data is not None and data.ndim > 3 and len(data) == 1:
+                    data = data[0]
+                contents.append((unit.header, data))
             elif isinstance(unit, fits.BinTableHDU) and not unit.header.get("EXTNAME", "").startswith("ARCHIVE"):
                 contents.append((unit.header, Table.read(unit)))
     return contents
@@ -257,7 +263,8 @@ def _with_planes(
     variance: Path | None,
 ) -> list[_Image]:
     """Return the images of a file with their masks and variances, those of files of their own before its own."""
-    planes: dict[str, list[tuple[fits.Header, np.ndarray]]] = {"image": [], **{kind: [] for kind in _PLANES}}
+    kinds = ("image", "mask", *(kind.value for kind in NoiseKind))
+    planes: dict[str, list[tuple[fits.Header, np.ndarray]]] = {kind: [] for kind in kinds}
     for header, data in units:
         if isinstance(data, np.ndarray):
             planes[_kind_of(header)].append((header, data))
@@ -279,11 +286,11 @@ def _with_planes(
         own_variance = None
         if planes["variance"]:
             own_variance = np.asarray(planes["variance"][k][1], dtype=np.float64)
+        elif planes["rms"]:
+            own_variance = np.asarray(planes["rms"][k][1], dtype=np.float64) ** 2
         elif planes["weight"]:
             weight = np.asarray(planes["weight"][k][1], dtype=np.float64)
             own_variance = np.where(weight > 0.0, 1.0 / np.where(weight > 0.0, weight, 1.0), np.nan)
-        elif planes["deviation"]:
-            own_variance = np.asarray(planes["deviation"][k][1], dtype=np.float64) ** 2
         noisy = None if own_variance is None else np.isfinite(own_variance) & (own_variance > 0.0)
         if noisy is not None and noisy.any():
             own_mask = own_mask | ~noisy
@@ -296,10 +303,12 @@ def _with_planes(
 
 
 def _kind_of(header: fits.Header) -> str:
-    """Return what the pixels of an image are: image, mask, variance, weight or deviation."""
-    name = str(header.get("EXTNAME", "")).strip().upper()
-    kind = next((k for k, names in _PLANES.items() if re.fullmatch(rf"({names})[_ ]?\d*", name)), "image")
-    return _UNCERTAINTIES.get(str(header.get("UTYPE", "")).strip(), kind) if kind == "deviation" else kind
+    """Return what the pixels of an image are: image, mask, variance, rms or weight."""
+    name = _NUMBER.sub("", str(header.get("EXTNAME", "")).strip().upper())
+    if name in MASK_NAMES:
+        return "mask"
+    kind = noise_kind(name, header)
+    return "image" if kind is None else kind.value
 
 
 def _bad_pixels(header: fits.Header, values: np.ndarray, path: Path) -> np.ndarray:

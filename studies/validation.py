@@ -35,9 +35,14 @@ from ..models.io.yaml.reader import MAX_BYTES, Prescription
 from ..models.parameters.degrees_of_freedom_file import DegreesOfFreedomFile, load_degrees_of_freedom
 from ..pipeline.config import Configuration, load_configuration, with_run
 from ..pipeline.experiment import Experiment
+from ..pipeline.listed_visit import check_bands
+from ..pipeline.named_files import read_run
 from .alignment.config import AlignConfig, load_align_configuration
+from .alignment.scene import AlignmentScene
 from .night.config import NightConfig, load_night_configuration
 from .sweep.file import SweepFile, load_sweep
+from .sweep.point import check_sweep
+from .sweep.sweep import check_room, numbered_points
 from .tolerance.file import ToleranceFile, load_tolerances
 from .visits.config import VisitsConfig, load_visits_configuration
 
@@ -60,9 +65,51 @@ def _load_run(path: Path) -> None:
     Experiment.from_config(load_configuration(path), path.parent)
 
 
+def _load_images(path: Path) -> None:
+    load_images_configuration(path).experiment(path.parent)
+
+
+def _load_visits(path: Path) -> None:
+    config, folder = load_visits_configuration(path), path.parent
+    named = config.visits.from_list
+    if named is not None and named.digest is None:
+        config = config.with_list(named, folder)
+    config.experiment(folder)
+    config.plan(config.run.seed)
+
+
+def _load_night(path: Path) -> None:
+    config, folder = load_night_configuration(path), path.parent
+    # The command may name another list, without which nothing is known of bands.
+    if config.visits.list is not None and (folder / config.visits.list).is_file():
+        check_bands(config.run, config.read_list(folder), folder)
+
+
+def _load_align(path: Path) -> None:
+    AlignmentScene.of(load_align_configuration(path), path.parent)
+
+
+def _load_sweep(path: Path) -> None:
+    sweep = load_sweep(path)
+    check_room(sweep, path)
+    check_sweep(sweep, numbered_points(sweep, path.parent), path.parent)
+
+
+def _with_base(content: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return the content of a sweep with that of the configuration that it names."""
+    base = content.get("base")
+    return {**content, "base": read_run(path.parent / base, path.parent)} if isinstance(base, str) else content
+
+
 def _load_tolerances(path: Path) -> None:
     # The command gives the telescope where the file does not.
     load_tolerances(path, "telescope")
+
+
+class _BaseOfSweep(BaseModel):
+    """Configuration that a sweep starts from, which its model leaves open: parameters add to it."""
+
+    base: Configuration
 
 
 SchemaKind = Literal[
@@ -83,16 +130,16 @@ SchemaKind = Literal[
 #: Chosen by what stands under its keys: runs name CCDs too.
 CAMERA = FileKind("camera", CameraFile, read_camera, PrescriptionError)
 #: Chosen by the list under its visits: stacks have visits too.
-NIGHT = FileKind("night", NightConfig, load_night_configuration, prepare=with_run)
+NIGHT = FileKind("night", NightConfig, _load_night, prepare=with_run)
 #: In the order in which the others are chosen where a file could be of two kinds.
 KINDS = (
     FileKind("prescription", Prescription, load_telescope, PrescriptionError),
     FileKind("run", Configuration, _load_run),
-    FileKind("sweep", SweepFile, load_sweep),
-    FileKind("images", ImagesConfig, load_images_configuration, prepare=with_run),
-    FileKind("visits", VisitsConfig, load_visits_configuration, prepare=with_run),
+    FileKind("sweep", SweepFile, _load_sweep, prepare=_with_base),
+    FileKind("images", ImagesConfig, _load_images, prepare=with_run),
+    FileKind("visits", VisitsConfig, _load_visits, prepare=with_run),
     NIGHT,
-    FileKind("align", AlignConfig, load_align_configuration),
+    FileKind("align", AlignConfig, _load_align),
     FileKind("site", SiteFile, load_site, PrescriptionError),
     FileKind("coatings", CoatingsFile, Coatings.read),
     FileKind("tolerances", ToleranceFile, _load_tolerances),
@@ -219,6 +266,8 @@ def _schema_problems(kind: FileKind, content: dict[str, Any], path: Path) -> lis
         return [error]
     context = {"folder": path.parent}
     schema_problems = problems_of(kind.model, prepared, str(path), kind.error, context)
+    if kind.model is SweepFile and isinstance(prepared.get("base"), dict):
+        schema_problems += problems_of(_BaseOfSweep, {"base": prepared["base"]}, str(path))
     if schema_problems or kind.model is not Prescription:
         return schema_problems
     prescription = Prescription.model_validate(prepared, context=context)

@@ -183,7 +183,7 @@ def design_command(
         parameters, option_names = _parameters(compute, band)
 
         def command(picture: Path | None, no_picture: bool, table: Path | None, as_json: bool, **values: Any) -> None:
-            kind = options.picture_kind(picture)
+            kind = options.picture_kind(picture, no_picture)
             import_modules(_NEEDED)
             shared = SharedOptions(**{f.name: values[f.name] for f in fields(SharedOptions) if f.name in values})
             try:

@@ -143,5 +143,8 @@ def band_wavelengths(
 
 def require_focus(telescope: Telescope, *values: np.ndarray) -> None:
     """Raise a DomainError where values are not finite since the light of a telescope is parallel."""
-    if telescope.design_data.afocal or not all(np.isfinite(value).all() for value in values):
-        raise DomainError(f"telescope {telescope.name}: expected one with a focus; its light is parallel")
+    finite = np.concatenate([np.isfinite(value).ravel() for value in values])
+    if telescope.design_data.afocal or not finite.all():
+        focused_in_part = finite.any() and not telescope.design_data.afocal
+        extent = " at some fields or along one direction, as behind a cylinder" if focused_in_part else ""
+        raise DomainError(f"telescope {telescope.name}: expected one with a focus; its light is parallel{extent}")

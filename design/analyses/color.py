@@ -143,7 +143,8 @@ class ChromaticFocus(Analysis):
         for k, (zone, color) in enumerate(zip(self.zones, (BLUE, ORANGE, RED, GREY) * 9, strict=False)):
             label = f"zone {zone:g}" if zone else "paraxial"
             axes.plot(self.shift[:, k] * scale, nm, "-" if np.ptp(nm) else "o", color=color, label=label)
-        axes.axvspan(-self.depth * scale, self.depth * scale, color="0.92", label="depth of focus")
+        if np.isfinite(self.depth):  # of light that is parallel along one direction there is none
+            axes.axvspan(-self.depth * scale, self.depth * scale, color="0.92", label="depth of focus")
         axes.axvline(0.0, color="0.5", linewidth=0.7)
         # A single wavelength has no range.
         limits = {"ylim": (nm.min(), nm.max())} if np.ptp(nm) else {}

@@ -175,9 +175,10 @@ def spot_matrix(
     )
     telescope = request.telescope
     bundles = [request.bundles(float(w)) for w in request.wavelengths]
-    ratio = principal_rays_of(request).mean_f_number
+    principal = principal_rays_of(request)
+    ratio = principal.mean_f_number
     if against == "focus" or not telescope.design_data.afocal:
-        require_focus(telescope, np.nan_to_num(ratio, posinf=np.inf))
+        require_focus(telescope, np.nan_to_num(principal.f_number, posinf=np.inf))
     if against == "wavelength":
         heights = np.zeros(1)
     elif defocus is None:

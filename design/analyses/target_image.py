@@ -206,7 +206,7 @@ def target_image(
     principal = principal_rays_of(request)
     if np.isnan(principal.mean_f_number).any():
         raise DomainError(f"{field_label(request.fields[0])}: no light passes; expected a lit pupil")
-    require_focus(telescope, principal.mean_f_number, principal.mean_plate_scale)
+    require_focus(telescope, principal.f_number, principal.mean_plate_scale)
     scale = float(principal.mean_plate_scale[0])
     airy = 1.22 * request.middle * float(principal.mean_f_number[0]) * scale
     across = 60.0 * airy if width is None else one_angle(width, "width")

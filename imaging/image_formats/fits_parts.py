@@ -30,7 +30,7 @@ class FitsPart:
     index: int
     name: str  #: EXTNAME in capitals; empty where there is none
     header: fits.Header  #: of the primary part too, where the image lies in an extension
-    image_shape: tuple[int, ...]  #: as NumPy has it; empty where there is no image
+    image_shape: tuple[int, ...]  #: as NumPy has it, without first axes of length 1; empty where there is no image
     version: int = 1  #: EXTVER, which tells parts of one name apart
 
     @property
@@ -74,7 +74,7 @@ class FitsParts:
             if _WRONG_SUM in (raw.verify_checksum(), raw.verify_datasum()):
                 raise ProductError(f"damaged ({part.name or 'image'} does not match its checksum)", file=self.path)
         with _opened(self.path) as hdus:
-            array = np.asarray(hdus[part.index].data)
+            array = np.asarray(hdus[part.index].data).reshape(part.image_shape)
             return np.array(array, dtype=array.dtype.newbyteorder("="))
 
 
@@ -99,11 +99,14 @@ def _part_of(index: int, hdu: fits.hdu.base.ExtensionHDU, primary: fits.Header) 
         for card in primary.cards:
             if card.keyword and card.keyword not in header and card.keyword not in ("COMMENT", "HISTORY", "SIMPLE"):
                 header.append(card, end=True)
-    shape = hdu.shape if isinstance(hdu, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)) else ()
+    is_image = isinstance(hdu, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU))
+    shape: tuple[int, ...] = tuple(hdu.shape) if is_image else ()
+    while len(shape) > 2 and shape[0] == 1:  # NAXIS3 = 1, as of one frequency or one plane of a cube
+        shape = shape[1:]
     # The first files of HSC have EXTTYPE in its place.
     name = str(hdu.header.get("EXTNAME") or hdu.header.get("EXTTYPE") or "").strip().upper()
     for keyword in _STRUCTURE:
         header.remove(keyword, ignore_missing=True, remove_all=True)
     # fpack names a nameless image so.
     name = "" if name == "COMPRESSED_IMAGE" else name
-    return FitsPart(index, name, header, tuple(shape), hdu.ver)
+    return FitsPart(index, name, header, shape, hdu.ver)

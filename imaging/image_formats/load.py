@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
+from ...core.noise_planes import NoiseKind
 from ...core.units import ARCSEC, positive_angle, require_positive
 from ...measure.pixel_masks import clipped_level, empty_pixels
 from ..image_file import CcdImage
@@ -28,7 +29,7 @@ from .pixel_noise import (
     variance_of_plane,
     with_photons,
 )
-from .planes import Defects, PlaneNames, WeightKind, companion_in, defects_of, planes_of
+from .planes import Defects, PlaneNames, companion_in, defects_of, planes_of
 from .world_cards import world_cards
 
 #: Bits of the mask of an image of another program.
@@ -277,7 +278,7 @@ def _noise_plane(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -
     noise_file, part, kind = file, planes.noise, planes.kind
     if settings.weight is not None:
         noise_file, part = companion_in(Path(settings.weight), planes.image)
-        kind = WeightKind(settings.weight_kind)
+        kind = NoiseKind(settings.weight_kind)
     if part is None:
         return None
     _require_shape(noise_file, part, planes.image)

@@ -11,8 +11,8 @@ import sep
 from scipy import ndimage
 
 from ...core.errors import ProductError
+from ...core.noise_planes import NoiseKind
 from ...core.statistics import RMS_PER_MAD
-from .planes import WeightKind
 
 #: Side of the cells in which sky and noise are measured [pixel], as of the detection.
 _CELL = 64
@@ -90,14 +90,14 @@ class PixelVariance:
     without: np.ndarray
 
 
-def variance_of_plane(plane: np.ndarray, kind: WeightKind, name: str) -> PixelVariance:
+def variance_of_plane(plane: np.ndarray, kind: NoiseKind, name: str) -> PixelVariance:
     """Return the variance of a plane of weights, variances or rms; pixels of next to no weight have none."""
     values = plane.astype(np.float64)
     good = np.isfinite(values) & (values > 0.0)
     values = np.where(good, values, 1.0)
-    if kind is WeightKind.WEIGHT:
+    if kind is NoiseKind.WEIGHT:
         values = 1.0 / values
-    elif kind is WeightKind.RMS:
+    elif kind is NoiseKind.RMS:
         values = values**2
     if good.any():
         good &= values <= _MOST_NOISE * float(np.median(values[good]))

@@ -7,9 +7,7 @@ have usual names or are files of their own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +15,7 @@ import numpy as np
 
 from ...core.errors import ProductError
 from ...core.mask_planes import HARMLESS, TOO_BRIGHT, bits_of, planes_in
+from ...core.noise_planes import MASK_NAMES, NOISE_NAMES, NoiseKind, noise_kind
 from ...core.number_text import counted
 from .fits_parts import FitsPart, FitsParts, beside
 
@@ -34,14 +33,6 @@ _EUCLID_SATURATED = 1 << 3 | 1 << 19 | 1 << 21
 _EUCLID_BAD = sum(1 << bit for bit in (0, 1, 2, 4, 5, 7, 8, 12, 15, 17, 22))
 
 
-class WeightKind(Enum):
-    """What a plane of noise holds: inverse variance, variance, or rms."""
-
-    WEIGHT = "weight"
-    VARIANCE = "variance"
-    RMS = "rms"
-
-
 class Defects(NamedTuple):
     """Pixels with defects, bool [ny, nx]."""
 
@@ -55,33 +46,8 @@ class PlaneNames:
 
     image: FitsPart
     noise: FitsPart | None = None
-    kind: WeightKind = WeightKind.WEIGHT
+    kind: NoiseKind = NoiseKind.WEIGHT
     mask: FitsPart | None = None
-
-
-#: Names of extensions of noise and of masks beside an image. Of a drizzled image with errors and weights the former
-#: have the noise of photons in them, and its scale.
-_NOISE_NAMES: Mapping[str, WeightKind] = {
-    "VARIANCE": WeightKind.VARIANCE,
-    "VAR": WeightKind.VARIANCE,
-    "ERR": WeightKind.RMS,
-    "ERROR": WeightKind.RMS,
-    "RMS": WeightKind.RMS,
-    "SIGMA": WeightKind.RMS,
-    "UNCERT": WeightKind.RMS,
-    "WGT": WeightKind.WEIGHT,
-    "WEIGHT": WeightKind.WEIGHT,
-    "WHT": WeightKind.WEIGHT,
-    "IVAR": WeightKind.WEIGHT,
-    "INVVAR": WeightKind.WEIGHT,
-}
-#: What the card UTYPE says of a plane of noise, in files of astropy's CCDData: its class.
-_UNCERTAINTIES: Mapping[str, WeightKind] = {
-    "StdDevUncertainty": WeightKind.RMS,
-    "VarianceUncertainty": WeightKind.VARIANCE,
-    "InverseVariance": WeightKind.WEIGHT,
-}
-_MASK_NAMES = ("MASK", "MSK", "DQ", "FLAGS", "DQM", "BPM")
 
 
 def planes_of(file: FitsParts, extension: str | None) -> list[PlaneNames]:
@@ -99,9 +65,9 @@ def planes_of(file: FitsParts, extension: str | None) -> list[PlaneNames]:
     ProductError
         If there is no image, or no such one.
     """
-    noise, masks = file.named(*_NOISE_NAMES), file.named(*_MASK_NAMES)
+    noise, masks = file.named(*NOISE_NAMES), file.named(*MASK_NAMES)
     of_euclid = _euclid_planes(file)
-    companions = {part.index for part in file.parts if part.name in _NOISE_NAMES or part.name in _MASK_NAMES}
+    companions = {part.index for part in file.parts if part.name in NOISE_NAMES or part.name in MASK_NAMES}
     companions |= {part.index for planes in of_euclid.values() for part in (planes.noise, planes.mask) if part}
     images = [part for part in file.parts if part.is_image and part.index not in companions]
     if not images:
@@ -119,9 +85,7 @@ def planes_of(file: FitsParts, extension: str | None) -> list[PlaneNames]:
         images = [part for part in images if part.name in ("IMAGE", "SCI")] or [
             part for part in images if part.image_shape == (noise or images)[0].image_shape
         ]
-    kind = WeightKind.WEIGHT
-    if noise:
-        kind = _UNCERTAINTIES.get(str(noise[0].header.get("UTYPE", "")).strip(), _NOISE_NAMES[noise[0].name])
+    kind = (noise and noise_kind(noise[0].name, noise[0].header)) or NoiseKind.WEIGHT
     return [PlaneNames(part, beside(part, noise), kind, beside(part, masks)) for part in images]
 
 
@@ -137,7 +101,7 @@ def _euclid_planes(file: FitsParts) -> dict[int, PlaneNames]:
         index: PlaneNames(
             file.parts[index],
             by_name.get(f"{stem}{_EUCLID_RMS}"),
-            WeightKind.RMS,
+            NoiseKind.RMS,
             by_name.get(f"{stem}{_EUCLID_FLAGS}"),
         )
         for index, stem in stems.items()

@@ -43,6 +43,8 @@ def world_cards(header: fits.Header, shape: tuple[int, int], path: Path) -> fits
             continue
         if card.keyword and _CARDS.fullmatch(card.keyword) and card.keyword not in cards:
             cards[card.keyword] = _value(header, card.keyword, path)
+    if "WCSAXES" in cards:  # others, as of frequencies, have no cards here
+        cards["WCSAXES"] = 2
     for key in ("RADESYS", "RADECSYS"):
         if system := str(cards.get(key, "")).strip().upper():
             if system not in _SYSTEMS:

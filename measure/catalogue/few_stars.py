@@ -12,7 +12,7 @@ from .cutouts import cut_out
 from .matching import match_positions
 from .objects import DetectedObjects, ObjectFlag
 from .pixel_checks import flagged
-from .star_locus import STAMP_SIDE, StarCut, StarSelection, median_and_sigma
+from .star_locus import ALIKE, STAMP_SIDE, StarCut, StarSelection, median_and_sigma
 
 #: Largest distance of an object from a named star [pixel].
 MATCH = 3.0
@@ -26,8 +26,6 @@ _SIGMA = 2.0
 _ELLIPTICITY = 0.03
 #: Least FWHM [pixel]: hot pixels and cosmic rays are alike, too.
 LEAST_FWHM = 1.5
-#: Least part of the smallest objects that are alike: galaxies of one size have many ellipticities.
-_ALIKE = 0.6
 #: Most objects, such as cosmic rays, that are smaller than stars.
 _MOST_SMALLER = 2
 
@@ -119,7 +117,7 @@ def smallest_stars(
             cuts[~(np.abs(values / np.median(values[group]) - 1.0) < _EQUAL - 1.0 + noise)] |= cut
         e1, e2 = (e - np.median(e[group]) for e in (objects.e1, objects.e2))
         cuts[~(np.hypot(e1, e2) < _ELLIPTICITY + noise)] |= StarCut.SHAPE
-        count, least = int((cuts == 0).sum()), max(FEWEST_STARS, int(np.ceil(_ALIKE * len(group))))
+        count, least = int((cuts == 0).sum()), max(FEWEST_STARS, int(np.ceil(ALIKE * len(group))))
         if count >= least:
             return _selection(objects, image, cuts, size, mask)
         reason = f"{count} of the {len(group)} smallest ones have one width and ellipticity, expected at least {least}"

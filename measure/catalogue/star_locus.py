@@ -35,6 +35,10 @@ _CONTRAST = 3.0
 _SIDE = (1.15, 1.75)
 # Least width of the locus, relative: the PSF varies over a CCD.
 _LEAST_WIDTH = 0.01
+#: Least part of the objects of one size that are alike: galaxies of one size have many ellipticities.
+ALIKE = 0.6
+# Largest deviation of the isophotal ellipticity of stars, by the change of the PSF over a CCD.
+_ELLIPTICITY = 0.1
 # Side of the stamps of stars [pixel].
 STAMP_SIDE = 31
 # Half-light radii of stars for which that side is right [pixel].
@@ -270,7 +274,8 @@ def select_stars(
     Raises
     ------
     DomainError
-        If the image has another shape, an option is out of range, or there is no stellar locus.
+        If the image has another shape, an option is out of range, or there is no stellar locus: too few objects of one
+        size, or of many ellipticities, which are galaxies.
     """
     pixels = real_array(image, "image: expected real numbers [ny, nx]")
     if pixels.shape != objects.segmentation.shape:
@@ -304,7 +309,14 @@ def select_stars(
     fwhm = median_and_sigma(objects.fwhm[of_locus])
     cuts[~(np.abs(objects.fwhm - fwhm[0]) < n_sigma * np.hypot(fwhm[1], fwhm[0] * noise))] |= StarCut.WIDTH
     e1, e2 = (e - np.median(e[of_locus]) for e in (objects.e1, objects.e2))
-    cuts[~(np.hypot(e1, e2) < max_ellipticity)] |= StarCut.SHAPE
+    deviation = np.hypot(e1, e2)
+    alike, count = int((deviation[of_locus] < _ELLIPTICITY).sum()), int(of_locus.sum())
+    if alike < ALIKE * count:
+        raise DomainError(
+            f"no stellar locus: {alike} of {count} bright objects of a half-light radius of {center:.3g} pixels have "
+            f"one ellipticity, expected at least {int(np.ceil(ALIKE * count))}"
+        )
+    cuts[~(deviation < max_ellipticity)] |= StarCut.SHAPE
     cuts[objects.neighbour_distance < isolation] |= StarCut.NEIGHBOUR
     light = np.where(bad, np.nan, pixels - objects.background)
     return StarSelection.of_objects(objects, cuts, (center, width), light, size)

@@ -36,7 +36,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ...core.arguments import check_arguments
-from ...core.errors import PrescriptionError, check_choice, unknown_name
+from ...core.errors import ConfigError, PrescriptionError, check_choice, unknown_name
 from ...core.files import content_hash, write_bytes
 from ...core.yaml_reader import read_mapping
 from ..mesh_file import files_of_mesh
@@ -232,7 +232,7 @@ def save_telescope(
     Raises
     ------
     ConfigError
-        If there is no such format.
+        If there is no such format, or the ending is that of another.
     PrescriptionError
         If the name has none of these endings, or the file cannot be written or hold the telescope.
     """
@@ -249,8 +249,12 @@ def prescription_files(
         raise PrescriptionError("the layout of Zemax archives is not published: save as .zmx", file=target)
     if target.suffix.lower() not in WRITTEN:
         raise PrescriptionError(f"expected a name that ends in {', '.join(WRITTEN)}", file=target)
-    format = format or WRITTEN[target.suffix.lower()]
+    of_ending = WRITTEN[target.suffix.lower()]
+    format = format or of_ending
     check_choice("format", format, dict.fromkeys(("pachon", "batoid", *WRITTEN.values())))
+    if format != of_ending and (format, of_ending) != ("batoid", "pachon"):
+        expected = f"{of_ending}, that of names that end in {target.suffix}"
+        raise ConfigError(f"format = {format}: expected {expected}", file=target, key="format")
     if format == "zemax":
         from .zemax.writer import catalogue_path, telescope_to_zemax
 

@@ -178,9 +178,15 @@ def _database_table(connection: sqlite3.Connection, path: Path) -> ListTable:
 
 
 def _fill(connection: sqlite3.Connection, columns: Mapping[str, Any]) -> tuple[str, ...]:
-    """Make a table of columns in memory; those with more than one number a row are left out. Return their names."""
+    """Make a table of columns in memory, and return their names.
+
+    Columns with more than one number a row are left out, and of names that differ in capitals only, which SQL does not
+    tell apart, those that are not in small letters.
+    """
     scalars = {
-        name.replace('"', "'").replace("\0", " "): values for name, values in columns.items() if np.ndim(values) == 1
+        name.replace('"', "'").replace("\0", " "): values
+        for name, values in columns.items()
+        if np.ndim(values) == 1 and name == name.lower()
     }
     if scalars:
         names = ", ".join(f'"{name}"' for name in scalars)

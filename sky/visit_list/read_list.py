@@ -90,8 +90,8 @@ def read_visit_list(
     ConfigError
         If `where` is no condition on its columns, or a word is unknown.
     DomainError
-        If no visit is left, two have one number, one lacks a number, lies below the horizon, or has a seeing that the
-        outer scale does not allow.
+        If no visit is left, rows of one number differ, or a visit lacks a number, lies below the horizon, or has a
+        seeing that the outer scale does not allow.
     """
     path = Path(path)
     check_choice("airmass_law", airmass_law, AIRMASS_LAWS)
@@ -105,7 +105,7 @@ def read_visit_list(
         if not len(columns):
             raise DomainError("no visit" + ("" if where is None else f" with {where}") + ": expected at least one")
         rows = _selection(columns, band, night)
-        columns = columns.rows(rows)
+        columns = _each_visit_once(columns.rows(rows))
         if not len(columns):
             wanted = ", ".join(
                 f"{name} {value}" for name, value in (("band", band), ("night", night)) if value is not None
@@ -164,6 +164,25 @@ def _visits(
     )
 
 
+def _each_visit_once(columns: ListColumns) -> ListColumns:
+    """Return columns without the rows that repeat a visit, as OpSim 3 does for each proposal, with equal values."""
+    if "visit" not in columns.values:
+        return columns
+    _, first, inverse = np.unique(columns.values["visit"], return_index=True, return_inverse=True)
+    of_visit = first[inverse]
+    # A row without a number is no visit.
+    repeats = (of_visit != np.arange(len(columns))) & np.isfinite(columns.values["visit"])
+    for values in columns.values.values():
+        repeats &= (values == values[of_visit]) | ((values != values) & (values[of_visit] != values[of_visit]))
+    if not repeats.any():
+        return columns
+    merged = columns.rows(~repeats)
+    rows_repeat = counted(int(repeats.sum()), "row repeats a visit", "rows repeat visits")
+    visits_are = counted(len(merged), "visit is", "visits are")
+    merged.remarks.append(f"{rows_repeat} with equal values, as of several proposals: {visits_are} taken")
+    return merged
+
+
 def _visit_numbers(columns: ListColumns) -> np.ndarray:
     """Return the numbers of the visits, those of the rows where there are none; DomainError where two are the same."""
     if "visit" not in columns.values:
@@ -181,9 +200,15 @@ def _visit_numbers(columns: ListColumns) -> np.ndarray:
     unique, counts = np.unique(numbers, return_counts=True)
     if (counts > 1).any():
         twice = unique[counts > 1]
-        others = f"; {len(twice)} numbers are repeated" if len(twice) > 1 else ""
+        rows = np.flatnonzero(numbers == twice[0])
+        differing_columns = [
+            columns.source[key] for key, column in columns.values.items() if len(np.unique(column[rows])) > 1
+        ]
+        reasons = f"; they differ in {', '.join(differing_columns)}"
+        if len(twice) > 1:
+            reasons += f"; {len(twice)} numbers are repeated"
         raise DomainError(
-            f"{name} = {twice[0]}: {counted(counts[counts > 1][0], 'row')}, expected each visit once{others}", key=name
+            f"{name} = {twice[0]}: {counted(counts[counts > 1][0], 'row')}, expected each visit once{reasons}", key=name
         )
     return numbers
 

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -27,6 +28,14 @@ from ...sky.visit_list.visit_list import VisitList
 #: Least and most numbers of pixels along a side of a base pixel: the coverage map's, and that of LSST's maps.
 _LEAST_SIDE = 32
 _MOST_SIDE = 32768
+
+
+#: Keys of a list that say which file and which visits of it are taken: their digest tells the visits.
+SELECTION_KEYS = ("list", "where", "band", "night")
+
+
+#: Site of telescopes that have none, as of a run.
+_SITE = "cerro_pachon"
 
 
 class ListSection(Section):
@@ -133,12 +142,12 @@ def _visits_of(
     state: object,
     selection: tuple[Any, Any, Any],
     camera: str,
-    air: tuple[str, float | None],
+    air: tuple[str, float | None, str],
     airmass_law: Any,
 ) -> VisitList:
     """Read the list in a file of a state."""
-    (where, band, night), (site, outer_scale) = selection, air
-    return read_visit_list(
+    (where, band, night), (site, outer_scale, remark) = selection, air
+    visits = read_visit_list(
         path,
         where=where,
         band=band,
@@ -148,6 +157,16 @@ def _visits_of(
         airmass_law=airmass_law,
         outer_scale=outer_scale,
     )
+    return replace(visits, remarks=(*visits.remarks, remark)) if remark else visits
+
+
+def require_same_list(folder: Path, noun: str, before: ListSection | None, now: ListSection | None) -> None:
+    """Raise ProductError where a folder holds something of other visits than those that are wanted now."""
+    if before is not None and now is not None and before.digest != now.digest:
+        raise ProductError(
+            f"{folder} holds {noun} of another list: {now.list} has changed, or other visits of it are taken; choose "
+            "another --out"
+        )
 
 
 def _state_of(path: Path) -> tuple[int, int] | None:
@@ -159,19 +178,27 @@ def _state_of(path: Path) -> tuple[int, int] | None:
     return status.st_mtime_ns, status.st_size
 
 
-def _air_of(run: Configuration, folder: Path | None) -> tuple[str, float | None]:
-    """Return the bundled site at which a run's telescope stands, and the outer scale of its air if it is another.
+def _air_of(run: Configuration, folder: Path | None) -> tuple[str, float | None, str]:
+    """Return the bundled site of a run, the outer scale of its air if it is another, and a remark where it is assumed.
 
     A site file has layers and an outer scale, but no place.
     """
+    from ...models.io.bundled import BUNDLED as TELESCOPES
     from ...models.io.prescription import load_telescope
     from ...models.io.site_file import BUNDLED, load_site
 
     from_folder = partial(path_beside, folder or Path())
     site, outer_scale = run.atmosphere.site, run.atmosphere.outer_scale_m
     if site in BUNDLED:
-        return site, outer_scale
+        return site, outer_scale, ""
+    telescope = None if run.telescope is None else load_telescope(from_folder(run.telescope))
+    place = None if telescope is None else telescope.site
+    if place is None and run.telescope in (None, *TELESCOPES):
+        place = _SITE
+    if site is None and place not in BUNDLED:
+        site = place
     if site is not None and outer_scale is None:
         outer_scale = float(load_site(from_folder(site)).outer_scale)
-    telescope = None if run.telescope is None else load_telescope(from_folder(run.telescope))
-    return (telescope and telescope.site) or "cerro_pachon", outer_scale
+    if place in BUNDLED:
+        return place, outer_scale, ""
+    return _SITE, outer_scale, f"telescope {run.telescope} has no bundled site: place of {_SITE} is taken"

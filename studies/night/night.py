@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError, PachonError, ProductError
+from ...core.errors import DomainError, PachonError
 from ...core.files import make_folder
 from ...core.long_work import Execution, claim_folder
 from ...core.number_text import counted
@@ -20,7 +20,7 @@ from ...pipeline.listed_visit import check_bands, visit_experiment
 from ...pipeline.memory import check_memory
 from ...pipeline.run_folder import CONFIG_NAME
 from ...sky.visit_list.visit_list import ListedVisit, VisitList
-from .config import NightConfig, load_night_configuration
+from .config import SELECTION_KEYS, NightConfig, load_night_configuration, require_same_list
 from .night_files import write_night
 from .sky_pixels import healpix_module
 from .visit_product import VisitProduct, VisitWork, has_ccd_products, product_name
@@ -201,11 +201,7 @@ def claim_night(folder: Path, config: NightConfig, *, resume: bool) -> None:
     if resume and path.is_file():
         with suppress(PachonError):  # claim_folder says what is wrong with the file
             before = load_night_configuration(path)
-    if before is not None and before.visits.digest != config.visits.digest:
-        raise ProductError(
-            f"{folder} holds a night of another list: {config.visits.list} has changed, or other visits of it are "
-            "taken; choose another --out"
-        )
+    require_same_list(folder, "a night", None if before is None else before.visits, config.visits)
     claim_folder(
         path,
         config.to_yaml().encode(),
@@ -214,6 +210,6 @@ def claim_night(folder: Path, config: NightConfig, *, resume: bool) -> None:
         now=config.as_dict(),
         read=lambda path: load_night_configuration(path).as_dict(),
         # The digest tells the visits, wherever their file lies now.
-        free_keys=[f"visits.{key}" for key in ("list", "where", "band", "night")],
+        free_keys=[f"visits.{key}" for key in SELECTION_KEYS],
         wanted=resume,
     )

@@ -22,6 +22,7 @@ import hashlib
 import math
 import os
 from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -29,11 +30,11 @@ from pydantic import Field, PrivateAttr
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, error_context
-from ...core.schema import Count, Real, Section, Whole, checked, plain_number, validated
+from ...core.schema import Count, Real, Section, Whole, checked, plain_number, validated, whole_number_keys
 from ...core.set_keys import set_key_errors, set_keys
 from ...core.yaml_reader import read_mapping
 from ...models.io.prescription import prescription_digest
-from ...pipeline.config import digest
+from ...pipeline.config import Configuration, digest
 from ...pipeline.named_files import FILES, read_run, with_named_files, with_path
 
 #: Values of the parameters of one point by name.
@@ -80,6 +81,16 @@ class Design(Section):
     replicas: Count = Field(
         1, description="times each point is computed, each time with another seed of heights, turbulence and stars"
     )
+
+
+#: Keys of the configuration whose whole numbers are odd.
+ODD_KEYS = frozenset({"psf.stamp"})
+
+
+@cache
+def whole_keys() -> frozenset[str]:
+    """Return the keys of the configuration whose values are whole numbers."""
+    return frozenset(whole_number_keys(Configuration))
 
 
 # Parameters whose values may name files.
@@ -182,6 +193,13 @@ def _check(sweep: SweepFile) -> None:
         if parameter.range is not None and not parameter.range[0] < parameter.range[1]:
             low, high = parameter.range
             raise ConfigError(f"{place}.range = [{low:g}, {high:g}]: expected the lower value first, then a higher one")
+        if name in whole_keys():
+            stated = {f"range[{i}]": end for i, end in enumerate(parameter.range or ())}
+            stated |= {f"marks.{mark}": value for mark, value in parameter.marks.items()}
+            for key, value in stated.items():
+                if value % 1.0 or (name in ODD_KEYS and value % 2.0 == 0.0):
+                    expected = "an odd number" if name in ODD_KEYS else "a whole number"
+                    raise ConfigError(f"{place}.{key} = {value:g}: expected {expected}")
         if parameter.normal is not None and not parameter.normal[1] > 0:
             raise ConfigError(f"{place}.normal = {list(parameter.normal)}: expected a standard deviation above 0")
         if parameter.nominal is None and sweep.design.kind == "one_at_a_time":

@@ -35,11 +35,13 @@ from ...pipeline.experiment import Experiment
 from ...pipeline.listed_visit import telescope_of_band
 from ...pipeline.resolved_values import require_drawn_stars
 from ...sky.pointing import Pointing
-from ..night.config import ListSection, read_section
+from ..night.config import SELECTION_KEYS, ListSection, read_section
 from .plan import Visit, listed_plan, plan_visits
 
 #: Side of the stamps of the stack [pixel].
 STACK_STAMP = 31
+#: Keys that a list of the same visits may have otherwise.
+LIST_KEYS = tuple(f"visits.from_list.{key}" for key in SELECTION_KEYS)
 #: Side of the stamps of a visit [pixel], of which turned axes cut the corners.
 VISIT_STAMP = 49
 #: Largest distance of a listed pointing from the common one [deg], that of dithers.
@@ -81,6 +83,8 @@ class VisitsSection(Section):
         return {key: value for key, value in content.items() if key != "from_list" or value is not None}
 
 
+#: Keys of visits that are drawn, which those of a list have themselves.
+_OF_DRAWN = ("count", "dither_deg", "roll_deg", "rotator_deg", "first_epoch")
 _ANGLES = {key: VisitsSection.model_fields[key].default for key in ("roll_deg", "rotator_deg", "rotator_limit_deg")}
 
 
@@ -114,6 +118,8 @@ class VisitsConfig(Section):
         visits = self.visits.model_dump(mode="json", exclude={"count", "snapshots"})
         # Default angles are left out, so that products from before these keys stay valid.
         visits = {key: value for key, value in visits.items() if key not in _ANGLES or value != _ANGLES[key]}
+        if self.visits.from_list is not None and self.visits.from_list.digest is not None:
+            visits["from_list"] = self.visits.from_list.digest
         return digest({"run": experiment.config_hash, "ccds": experiment.config.ccds, "visits": visits})
 
     def galaxies_digest(self, experiment: Experiment, **content: Any) -> str:
@@ -168,17 +174,22 @@ class VisitsConfig(Section):
     def with_list(self, section: ListSection, folder: Path | None = None) -> VisitsConfig:
         """Return the settings of the visits of a list of one field, whose run has their band, pointing and time.
 
-        The common pointing is that of the run, or the middle of the list.
+        The common pointing is that of the run, or the middle of the list. Relative paths start from `folder`.
 
         Raises
         ------
         PachonError
             If the list cannot be read.
         ConfigError
-            If it has several bands, or pointings more than 5 degrees apart.
+            If it has several bands, or pointings more than 5 degrees apart, or the settings those of visits without a
+            list.
         """
+        begun = self.visits.from_list is not None and self.visits.from_list.digest is not None
+        for key in () if begun else _OF_DRAWN:
+            if getattr(self.visits, key) != VisitsSection.model_fields[key].default:
+                raise ConfigError(f"visits.{key}: expected none with a list, whose visits have their own")
         section = section.model_copy(update={"list": str(((folder or Path()) / str(section.list)).resolve())})
-        listed = read_section(section, self.run)
+        listed = read_section(section, self.run, folder)
         bands = np.unique(listed.band).tolist()
         if len(bands) > 1:
             raise ConfigError(f"{listed.source}: bands {', '.join(bands)}: expected one for a stack, by --band")

@@ -222,22 +222,25 @@ class PsfStack(Result):
 
     @property
     def e1_sky(self) -> np.ndarray:
-        """Ellipticity of the true PSF on the sky, > 0 from east to west."""
+        """Ellipticity of the true PSF along xi and eta, as of the table's places, > 0 from east to west.
+
+        North of a place is not along eta: about the common pointing at -28 deg it is 0.5 deg off at 1 deg from it.
+        """
         return self._along_sky(self.e1, self.e2)[0]
 
     @property
     def e2_sky(self) -> np.ndarray:
-        """Ellipticity of the true PSF on the sky, > 0 from north-west to south-east."""
+        """Ellipticity of the true PSF along xi and eta, > 0 from north-west to south-east."""
         return self._along_sky(self.e1, self.e2)[1]
 
     @property
     def g1_sky(self) -> np.ndarray:
-        """Ellipticity g of adaptive moments of the true PSF on the sky, > 0 from east to west."""
+        """Ellipticity g of adaptive moments of the true PSF along xi and eta, > 0 from east to west."""
         return self._along_sky(self.g1, self.g2)[0]
 
     @property
     def g2_sky(self) -> np.ndarray:
-        """Ellipticity g of adaptive moments of the true PSF on the sky, > 0 from north-west to south-east."""
+        """Ellipticity g of adaptive moments of the true PSF along xi and eta, > 0 from north-west to south-east."""
         return self._along_sky(self.g1, self.g2)[1]
 
     def _along_sky(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -307,9 +310,9 @@ class PsfStack(Result):
                 for name, (scale, unit, description) in {**_COLUMNS, **_ADAPTIVE_COLUMNS}.items()
             }
             | {
-                "E1_SKY": (self.e1_sky, "", "E1, E2 on the sky, > 0 from east to west"),
+                "E1_SKY": (self.e1_sky, "", "E1, E2 along xi and eta, > 0 from east to west"),
                 "E2_SKY": (self.e2_sky, "", "likewise, > 0 from north-west to south-east"),
-                "G1_SKY": (self.g1_sky, "", "G1, G2 on the sky, > 0 from east to west"),
+                "G1_SKY": (self.g1_sky, "", "G1, G2 along xi and eta, > 0 from east to west"),
                 "G2_SKY": (self.g2_sky, "", "likewise, > 0 from north-west to south-east"),
             },
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError, ProductError
+from ...core.errors import DomainError, PachonError, ProductError
 from ...core.files import make_folder, write_bytes, write_json
 from ...core.long_work import Execution, claim_folder
 from ...core.memory import readable
@@ -22,7 +23,8 @@ from ...core.units import ARCSEC
 from ...pipeline.experiment import Experiment
 from ...pipeline.memory import check_memory
 from ...pipeline.run_folder import CONFIG_NAME, SUMMARY_NAME
-from .config import STACK_STAMP, VisitsConfig, load_visits_configuration
+from ..night.config import read_section, require_same_list
+from .config import LIST_KEYS, STACK_STAMP, VisitsConfig, load_visits_configuration
 from .plan import Visit
 from .plots import correlation_picture, ellipticity_picture
 from .psf_visit import (
@@ -116,6 +118,9 @@ def stack_visits(
     if config.visits.from_list is not None:
         # A star has one magnitude in all visits.
         visits = tuple(replace(visit, star_limits=magnitude_limits(experiment)) for visit in visits)
+        listed = read_section(config.visits.from_list, config.run)
+        for remark in listed.remarks:
+            execution.reporter.line(f"{listed.source}: {remark}")
     check_rotators(experiment, visits)
     make_folder(folder)
     _check_room(folder, points, len(config.kept))
@@ -197,14 +202,21 @@ def claim_visits(folder: Path, config: VisitsConfig, *, resume: bool) -> None:
     def plain(settings: VisitsConfig) -> dict[str, Any]:
         return settings.model_dump(mode="json", by_alias=True)
 
+    path = folder / CONFIG_NAME
+    before: VisitsConfig | None = None
+    if resume and path.is_file():
+        with suppress(PachonError):  # claim_folder says what is wrong with the file
+            before = load_visits_configuration(path)
+    require_same_list(folder, "visits", None if before is None else before.visits.from_list, config.visits.from_list)
     claim_folder(
-        folder / CONFIG_NAME,
+        path,
         config.to_yaml().encode(),
         products="stack_*.fits",
         noun="visits",
         now=plain(config),
         read=lambda path: plain(load_visits_configuration(path)),
-        free_keys=("galaxies", "visits.count", "visits.snapshots"),
+        # The digest tells the visits of a list, wherever its file lies now.
+        free_keys=("galaxies", "visits.count", "visits.snapshots", *LIST_KEYS),
         wanted=resume,
     )
 

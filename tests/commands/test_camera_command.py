@@ -83,3 +83,21 @@ def test_a_camera_file_without_pixel_um_is_one_all_the_same(command, words, tmp_
     err = capsys.readouterr().err
     assert err.count("\n") == 1
     assert words in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["camera", "hsc", "--picture", "a.png", "--no-picture"], "--picture and --no-picture: expected one of them"),
+        (["rays", "paul_baker", "--picture", "a.png", "--no-picture"], "--picture and --no-picture: expected one"),
+        (["donuts", "a.fits", "--picture", "a.png", "--no-picture"], "--picture and --no-picture: expected one of"),
+        (["model", "a.fits", "--picture", "a.png", "--no-picture"], "--picture and --no-picture: expected one of"),
+        (["info", "--configuration", "2"], "--configuration: expected MODEL with it"),
+    ],
+)
+def test_options_that_exclude_one_another(arguments, message, capsys, tmp_path, monkeypatch):
+    """The first was ignored."""
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -150,3 +150,10 @@ def test_arrays_of_a_damaged_file_are_refused_in_one_line(tmp_path, seed):
     assert len(said.splitlines()) == 1
     # A flipped bit of a date or of a name that nobody asks for: what is there is what was written.
     assert all(np.array_equal(v, arrays[k]) for k, v in after.items() if k in arrays)
+
+
+def test_json_keeps_the_digits_of_a_configuration():
+    """Nine digits of a date, as results have, are 9 s."""
+    settings = {"visit": {"mid_mjd": 61001.15034567}, "pointing": [211.123456789012]}
+    content = json.loads(json_text({"configuration": settings, "fwhm": 61001.15034567}))
+    assert content == {"configuration": settings, "fwhm": 61001.1503}

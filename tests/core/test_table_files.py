@@ -5,8 +5,9 @@ import pytest
 from astropy import units as u
 from astropy.io import fits
 from astropy.table import Column, MaskedColumn, QTable, Table
+from astropy.time import Time
 
-from pachon.core.errors import ConfigError
+from pachon.core.errors import ConfigError, ProductError
 from pachon.core.table_files import column_in_unit, in_format_of, parquet_bytes, read_columns, write_table
 
 pyarrow = pytest.importorskip("pyarrow")
@@ -77,6 +78,27 @@ def test_names_that_units_would_change_are_kept(tmp_path):
     headings = ("mag [g]", "mag [r]", "flux [1]", "x", "x [deg]", "[m]", "a [no such unit]")
     path.write_text(",".join(headings) + "\n" + ",".join("1234567") + "\n")
     assert tuple(read_columns(path)) == headings
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_names_that_differ_in_capitals_are_two_columns(tmp_path, ending):
+    """Johnson's R stood for Sloan's r, which came before it."""
+    path = tmp_path / f"t.{ending}"
+    write_table(path, Table({"r": [20.0], "R": [19.0], "Mag": [18.0]}))
+    columns = read_columns(path)
+    assert {name: float(values[0]) for name, values in columns.items()} == {"r": 20.0, "R": 19.0, "mag": 18.0}
+    write_table(path, Table({"MAG": [20.0], "Mag": [19.0]}))
+    with pytest.raises(ProductError, match=rf"t\.{ending}: columns MAG and Mag: expected names that differ"):
+        read_columns(path)
+
+
+@pytest.mark.parametrize(("scale", "kind"), [("UTC", Time), ("UTC(NTP)", Column)])
+def test_times_of_fits_in_any_scale(tmp_path, scale, kind):
+    table = Table({"mag": [20.0], "TIME": Column([5.0], unit="d")}, meta={"TIMESYS": scale, "MJDREF": 60000.0})
+    table.write(tmp_path / "t.fits")
+    columns = read_columns(tmp_path / "t.fits")
+    assert columns["mag"].tolist() == [20.0]
+    assert isinstance(columns["time"], kind)
 
 
 def test_fits_has_texts_beyond_ascii_as_escapes(tmp_path):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import pachon
+from pachon.core.errors import DomainError
 from pachon.design.report import report, sections
 from pachon.design.report.prescription_table import first_order_rows, prescription_rows
 from pachon.models.shapes.freeform import Toroid
@@ -155,3 +156,12 @@ def test_the_verdict_on_a_cylinder_has_no_airy_disc(paraboloid):
     cylinder = paraboloid(2.0, 20.0).with_shape("mirror", Toroid(np.inf, 4.0, -1.0))
     where = sections.Where(cylinder, np.zeros((1, 2)), np.array([5e-7]), None)
     assert report._verdict(where) == "Its spots have 2.5e+04 µm rms radius at its one field."
+
+
+def test_light_of_a_cylinder_is_parallel_along_one_direction(paraboloid):
+    """All of it was said to be; and the depth of focus, infinite, was drawn with a warning of NumPy."""
+    cylinder = paraboloid(2.0, 20.0).with_shape("mirror", Toroid(np.inf, 4.0, -1.0))
+    for analysis in (pachon.field_curvature, pachon.design.spot_matrix, pachon.design.target_image):
+        with pytest.raises(DomainError, match="its light is parallel at some fields or along one direction"):
+            analysis(cylinder)
+    assert pachon.design.chromatic_focus(cylinder).plot().axes

@@ -100,6 +100,11 @@ def test_columns_of_other_names_are_mapped(tmp_path, telescope, places, magnitud
     table.write(path)
     found = placed(path, telescope, columns={"ra": "ALPHA", "mag": "g_psf"})
     expect(found, places, magnitudes + 1)
+    # SIMBAD has Johnson's R beside Sloan's r.
+    path = tmp_path / "capitals.ecsv"
+    Table({"ra": sky[:, 0], "dec": sky[:, 1], "R": magnitudes, "r": magnitudes + 1}).write(path)
+    expect(placed(path, telescope, columns={"mag": "R"}), places, magnitudes)
+    expect(placed(path, telescope), places, magnitudes + 1)
 
 
 def test_stars_that_are_left_out_are_counted(tmp_path, telescope):

@@ -365,6 +365,7 @@ def test_bad_positions_name_file_and_row(tmp_path, text, part):
     ("name", "kind", "value"),
     [
         ("ERR", None, 3.0),
+        ("RMS_1", None, 3.0),
         ("UNCERT", "StdDevUncertainty", 3.0),
         ("UNCERT", "VarianceUncertainty", 9.0),
         ("UNCERT", "InverseVariance", 1.0 / 9.0),
@@ -380,6 +381,24 @@ def test_planes_of_standard_deviations(tmp_path, name, kind, value):
     stamps = read_stamps(tmp_path / "a.fits")
     assert len(stamps) == 1
     np.testing.assert_allclose(stamps.variances[0], 9.0, rtol=1e-14)
+
+
+def test_errors_count_before_weights(tmp_path):
+    """Weights of drizzled images are exposure times, and no inverse variances."""
+    image = np.ones((12, 12))
+    planes = [fits.ImageHDU(value * image, name=name) for name, value in (("SCI", 1.0), ("WHT", 900.0), ("ERR", 3.0))]
+    fits.HDUList([fits.PrimaryHDU(), *planes]).writeto(tmp_path / "a.fits")
+    np.testing.assert_array_equal(read_stamps(tmp_path / "a.fits").variances[0], 9.0)
+
+
+@pytest.mark.parametrize("axes", [(1,), (1, 1)])
+def test_images_of_ccds_with_axes_of_length_one(tmp_path, axes):
+    """NAXIS3 = 1 made a cube of one stamp of it, for which a table of two donuts was refused."""
+    image = np.arange(40.0 * 50.0).reshape(40, 50)
+    (tmp_path / "stars.csv").write_text("x,y\n10,12\n30,20\n")
+    fits.PrimaryHDU(image.reshape(*axes, 40, 50)).writeto(tmp_path / "ccd.fits")
+    stamps = read_stamps(tmp_path / "ccd.fits", positions=tmp_path / "stars.csv", size=16)
+    np.testing.assert_array_equal(stamps.images, [image[4:20, 2:18], image[12:28, 22:38]])
 
 
 def test_small_stamps_are_said_to_be(tmp_path):

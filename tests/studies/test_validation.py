@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from visit_rows import COLUMNS, ROWS
 
 import pachon
 from pachon.core.errors import ConfigError
@@ -71,6 +72,13 @@ def test_values_that_contradict_one_another(tmp_path):
         ("stars: {truth: -1, obsrved: 3}\nband: q\n", "run", ["stars.obsrved", "band", "stars.truth"]),
         ("name: s\nparameters: {}\nmetrics: [fwhm]\ndesign: {kind: grit}\n", "sweep", ["design.kind"]),
         ("name: s\nparameters: {}\nmetrics: [fwhm]\n", "sweep", [None]),
+        (
+            "base: {stars: {truth: -1}, psf: {stmp: 3}}\nparameters: {M2.dz_um: {nominal: 0, range: [0, 9]}}\n",
+            "sweep",
+            ["base.psf.stmp", "base.stars.truth"],
+        ),
+        ("parameters: {M2.dz_um: {nominal: 0, range: [0, 9]}}\nmetrics: [fwhmm]\n", "sweep", [None]),
+        ("parameters: {M9.dz_um: {nominal: 0, range: [0, 9]}}\n", "sweep", [None]),
         ("coatings: {a: {wavelength_nm: [5, 4]}}\nsurfaces: {M1: a}\n", "coatings", ["coatings.a.efficiency"]),
         ("tolerances: [{name: S1.radius_mm, size: 1}]\nloss: 3\n", "tolerances", ["loss"]),
         ("tolerances: [{name: S1.radius_mm, size: 1}]\ndraws: 20\n", "tolerances", []),
@@ -122,6 +130,45 @@ def test_a_list_makes_visits_a_night(tmp_path):
     assert places(found) == {("line 2", "visits.bands"), ("line 3", "maps.nsid")}
     path.write_text("run: {ccds: [R22]}\nvisits: {count: 3}\n")
     assert pachon.validate_file(path).kind == "visits"
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "problem"),
+    [
+        ("images", "run: {telescope: nosuch}\nimage: {exposures: 2}\n", "unknown telescope 'nosuch'"),
+        ("visits", "run: {ccds: [R99_S11]}\nvisits: {count: 2}\n", "unknown CCD of lsst 'R99_S11'"),
+        ("visits", "visits: {count: 2, roll_deg: [0]}\n", "visits.roll_deg"),
+        ("night", "run: {telescope: comcam_r}\nvisits: {list: list.csv}\n", "band i, 1 visit of list.csv: "),
+        ("align", "visits: 3\ntelescope: nosuch\n", "unknown telescope 'nosuch'"),
+    ],
+)
+def test_names_that_configurations_name(tmp_path, kind, text, problem):
+    """Of runs alone they were looked up: others had no problems, and ended in their commands at once."""
+    (tmp_path / "list.csv").write_text("\n".join([",".join(COLUMNS), ",".join(map(str, ROWS[2]))]))
+    (tmp_path / "file.yaml").write_text(text)
+    found = pachon.validate_file(tmp_path / "file.yaml")
+    assert found.kind == kind
+    assert problem in str(found.problems[0])
+
+
+@pytest.mark.parametrize(
+    ("text", "problems"),
+    [
+        ("visits: {roll_deg: 5}\n", ["visits.roll_deg = 5: expected one of random, or a list"]),
+        ("visits: {roll_deg: [a]}\n", ['visits.roll_deg[0] = "a": expected a number']),
+        ("base: 5\nparameters: {}\n", ["base = 5: expected a mapping of keys to values, or a text"]),
+        (
+            "name: c\nsource: s\npixel_um: 15\npixels: [9, 9]\nccds: [{name: A, x_mm: 0, y_mm: 0}]\nphotometry: 3\n",
+            ["photometry = 3: expected one of lsst, or a mapping of keys to values"],
+        ),
+    ],
+)
+def test_values_of_several_types_have_one_problem(tmp_path, text, problems):
+    """Each type had one, under its name in pydantic: visits.roll_deg.tuple[function-after[forbid_inf..."""
+    (tmp_path / "file.yaml").write_text(text)
+    found = pachon.validate_file(tmp_path / "file.yaml").problems
+    assert [problem.problem for problem in found] == problems
+    assert all(problem.place for problem in found)
 
 
 def test_unknown_files(tmp_path):

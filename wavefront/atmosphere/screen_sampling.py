@@ -61,5 +61,12 @@ class ScreenSampling:
         """Return the wavenumber between low and high modes [rad/m] for a Fried parameter [m]."""
         if self.cutoff is not None:
             return float(self.cutoff)
-        # Up to half the Nyquist limit: rays read slopes at the nearest sample, then at most an eighth of a wave away.
-        return min(DEFAULT_CUTOFF / r0, 0.5 * math.pi * self.screen_size / self.screen_length)
+        return min(DEFAULT_CUTOFF / r0, largest_cutoff(self.screen_size, self.screen_length))
+
+
+def largest_cutoff(screen_size: int, screen_length: float) -> float:
+    """Return the largest default cut-off [rad/m] of low screens with samples on a side of a length [m].
+
+    It is half the Nyquist limit: rays read slopes at the nearest sample, then at most an eighth of a wave away.
+    """
+    return 0.5 * math.pi * screen_size / screen_length

@@ -31,6 +31,7 @@ from ...models.zernike_polynomials import annular_zernike_gradients
 from ..aberration import ResidualWavefront
 from ..atmosphere.exposure_fields import NOLL, ExposureFields, draw_exposure
 from ..atmosphere.moment_covariance import LEAST_EXPOSURE, ExposedAir
+from ..atmosphere.screen_sampling import DEFAULT_CUTOFF, largest_cutoff
 from ..pupil_optics import PupilOptics, trace_pupils
 from .clear_pupil import SpokePupil
 from .engine import ExposedStars, PsfInputs, Stars
@@ -120,7 +121,11 @@ class StatisticalRenderer(LongExposureRenderer):
         check_exposure(air.exposure, float(air.times[0]) - 0.5 * air.exposure / len(air.times))
         telescope = inputs.telescope
         self._base = inputs.aberration
-        self._exposed_air = ExposedAir.of(air, telescope.pupil_diameter, telescope.pupil_obscuration)
+        exposed_air = ExposedAir.of(air, telescope.pupil_diameter, telescope.pupil_obscuration)
+        if air.cutoff == largest_cutoff(air.screen_size, air.screen_length):
+            # Coarse screens would limit slopes, but there are none.
+            exposed_air = exposed_air._replace(cutoff=DEFAULT_CUTOFF / air.r0)
+        self._exposed_air = exposed_air
         # Whichever wavelengths stand for those of the light, the exposure drawn is one.
         self._asked = inputs
         self._rule = None if inputs.has_spectra else spectral_rule(inputs, self.depths)

@@ -143,6 +143,7 @@ class _Reader:
         self.path, self.findings, self.glasses = path, findings, glasses
         self.description = LensDescription(path, FORMAT, findings)
         self.surfaces: list[_Surface] = []
+        self.stop: _Surface | None = None
         #: Last command of each kind of the whole system.
         self.system: dict[str, Record] = {}
         self.radii = assumed_radii
@@ -167,9 +168,8 @@ class _Reader:
         for command in self.pick_ups:
             self._pick_up(command)
         self._check_solves()
-        if not any(surface.stop for surface in self.surfaces):
-            # Where a file names no stop, it is the first surface.
-            self.surfaces[1].stop = True
+        # The last command counts; where a file names no stop, it is the first surface.
+        (self.stop or self.surfaces[1]).stop = True
         self._state_system()
         self._place()
         return self.description
@@ -246,7 +246,7 @@ class _Reader:
         elif key == "GLA":
             surface.glass, surface.glass_name = command, (words or ("AIR",))[0]
         elif key == "STO":
-            surface.stop, surface.commands[key] = True, command
+            self.stop, surface.commands[key] = surface, command
         elif key == "SLB":
             surface.name = command.text.strip("'\" ")
         elif key in NUMBERS:

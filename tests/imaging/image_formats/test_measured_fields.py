@@ -15,6 +15,7 @@ import pachon
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, PachonError, ProductError
 from pachon.imaging.image_psf import psfs_on
+from pachon.imaging.image_stars import detected_objects, few_or_many_stars
 from pachon.imaging.star_positions import table_in
 from pachon.measure.catalogue.matching import match_positions
 
@@ -142,13 +143,24 @@ def test_saturated_stars_are_no_galaxies(field, tmp_path):
     assert usable == [False, True]
 
 
-@pytest.mark.parametrize("n_stars", [0, 2])
-def test_fewer_stars_than_three_are_too_few(n_stars, tmp_path):
-    field = draw_field(n_stars, 20, seed=3, side=250)
+@pytest.mark.parametrize(("n_stars", "n_galaxies"), [(0, 20), (2, 20), (1, 40)])
+def test_fewer_stars_than_three_are_too_few(n_stars, n_galaxies, tmp_path):
+    """Of forty galaxies of about one size eleven were stars, without a word."""
+    field = draw_field(n_stars, n_galaxies, seed=3, side=320 if n_galaxies == 40 else 250)
     image = loaded(field, tmp_path)
     with pytest.raises(DomainError, match="; or a lower min_snr, a catalogue") as caught:
         pachon.measure_image(image)
     assert str(caught.value).startswith("CCD a: no stars")
+
+
+def test_stars_among_many_galaxies_of_one_size(tmp_path):
+    """The mode of sizes was that of galaxies: none of 65 stars was one."""
+    field = draw_field(30, 300, seed=2, side=920)
+    image = loaded(field, tmp_path)
+    stars = few_or_many_stars(image, detected_objects(image), 30.0)
+    match = match_positions(*stars.positions.T, *field.places.T, 1.0)
+    assert len(stars) == 30
+    assert field.star[match].all()
 
 
 @pytest.mark.slow
@@ -333,6 +345,9 @@ def test_images_that_lack_something_are_one_line(field, tmp_path, capsys):
         (("--extension", "N4"), "extension = N4: expected one of 0"),
         (("--psf", "x.fits", "--recipe", "paper"), "expected none with --psf"),
         (("--psf", "x.fits", "--model", "focal_plane"), "--psf: expected with --model ccd alone"),
+        (("--gain", "2", "--model", "focal_plane"), "--gain: expected with --model ccd alone"),
+        (("--stars", "x.csv", "--model", "focal_plane"), "--stars: expected with --model ccd alone"),
+        (("--weight-kind", "rms"), "--weight-kind: expected --weight with it"),
     ):
         assert main(["measure", str(tmp_path / "a.fits"), "--quiet", *options]) == 2
         error = capsys.readouterr().err

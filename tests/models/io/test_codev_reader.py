@@ -188,6 +188,13 @@ def test_what_is_not_understood_is_one_line(tmp_path, old, new, expected):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(("first", "second", "stop"), [("1", "2", "S2"), ("2", "1", "S1")])
+def test_the_last_command_of_the_stop_counts(tmp_path, first, second, stop):
+    """It was the last surface with one."""
+    text = TRIPLET.replace("  STO\n", "") + f"\nSTO S{first}\nSTO S{second}\n"
+    assert load_telescope(written(tmp_path, text)).design_data.stop == stop
+
+
 def test_lenient_warns(tmp_path):
     text = TRIPLET.replace("  STO", "  STO; XYZ 3")
     with pytest.warns(PrescriptionWarning, match="surface 5: XYZ 3: this command is not understood"):

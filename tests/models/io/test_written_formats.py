@@ -440,6 +440,9 @@ def test_archives_are_not_written(tmp_path):
         ConfigError, match="format = 'zar': expected one of pachon, batoid, zemax, codev, oslo, optiland"
     ):
         pachon.save_telescope(lens("doublet"), tmp_path / "a.seq", format="zar")
+    # Files of CODE V in YAML were written, and no longer read.
+    with pytest.raises(ConfigError, match=r"a\.yaml: format = codev: expected pachon, that of names that end in .yaml"):
+        pachon.save_telescope(lens("doublet"), tmp_path / "a.yaml", format="codev")
 
 
 def test_the_table_of_the_docs_names_the_endings_that_are_written():

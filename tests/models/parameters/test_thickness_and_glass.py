@@ -70,6 +70,13 @@ def test_a_tilted_plate_turns_no_light_to_a_fold(tmp_path):
     telescope = pachon.load_telescope(tmp_path / "plate.zmx")
     assert len(telescope.surfaces) == 7
     assert Parameter.parse("fold.thickness", telescope).value(telescope) == pytest.approx(0.0459, rel=1e-12)
+    # Nor is the distance behind the plate along its own normal: it was 15.6 mm for the 18 of the file.
+    assert Parameter.parse("S5.thickness", telescope).value(telescope) == pytest.approx(0.002, rel=1e-12)
+    behind = Parameter.parse("S6.thickness", telescope)
+    assert behind.value(telescope) == pytest.approx(0.018, rel=1e-12)
+    moved = [s.vertex for s in apply(telescope, {"S6.thickness": 1e-3}).surfaces]
+    shifts = np.subtract(moved, [s.vertex for s in telescope.surfaces])
+    np.testing.assert_allclose(shifts, [[0, 0, 0]] * 5 + [[0, 0, -0.001]] * 2, atol=1e-15)
 
 
 def test_a_misaligned_mirror_keeps_its_own_axis(lsst_r):

@@ -99,6 +99,20 @@ def test_the_command_writes_tables_and_prints_json(stars, found, tmp_path, capsy
     assert capsys.readouterr().err.strip().endswith("none.piff: no such file")
 
 
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--x", "X"], "--x: expected --piff with it"),
+        (["--min-snr", "50"], "--min-snr: expected --piff with it"),
+        (["--strict", "--piff", str(DATA / "gaussian.piff")], "--strict with --piff: expected none"),
+    ],
+)
+def test_options_of_the_other_comparison_are_refused(options, text, capsys):
+    """They were ignored."""
+    assert main(["diagnose", "none", *options]) == 2
+    assert text in capsys.readouterr().err
+
+
 @pytest.mark.long
 def test_stars_have_their_colours_in_every_model(psf, stars):
     """Colours of all stars came to the model of those of Piff's fit alone, which refused them."""

@@ -156,7 +156,22 @@ def test_databases_of_opsim_3_have_radians(visits, write_database):
     same_visits(old.rows(visits.snaps == 1), one_snap)
 
 
+def test_visits_of_several_proposals_are_one_each(visits, write_list, write_database):
+    """The table Summary of OpSim 3 has a row for each visit and proposal; such databases were refused."""
+    rows = [0, 0, 1, 2, 2, 2, 3, 4]
+    columns = {OLD_NAMES.get(name, name): column(name)[rows] for name in COLUMNS}
+    columns |= {"propID": np.array([54, 56, 54, 54, 55, 56, 54, 54]), "altitude": np.full(8, None)}
+    path = write_database("Summary", columns)
+    merged = read_visit_list(path)
+    assert merged.digest == visits.digest
+    assert "3 rows repeat visits with equal values, as of several proposals: 5 visits are taken" in merged.remarks
+    assert read_visit_list(path, where="propID = 56").visit.tolist() == [1001, 1003]
+    with pytest.raises(DomainError, match=r"observationid = 1001: 2 rows, .* once; they differ in fieldra$"):
+        read_visit_list(write_list(observationId=[1001, 1001, 3, 4, 5], **dict.fromkeys(SAME, [1.0] * 5)))
+
+
 OLD_NAMES = {"observationId": "obsHistID", "observationStartMJD": "expMJD"}
+SAME = ("fieldDec", "observationStartMJD", "seeingFwhm500", "skyBrightness", "night")
 
 
 def test_names_of_opsim_3_with_degrees(visits, write_database):
@@ -458,6 +473,27 @@ def test_columns_of_other_types(visits, tmp_path, kind):
     path = tmp_path / "visits.parquet"
     parquet.write_table(pyarrow.table(columns), path)
     same_visits(read_visit_list(path), visits)
+
+
+def test_names_that_differ_in_capitals(visits, write_list):
+    """The column in small letters is taken, whatever the order; of others none."""
+    both = dict(ra=column("fieldRA"), RA=[0.0] * 5)
+    for columns in (both, dict(reversed(both.items()))):
+        assert read_visit_list(write_list(drop=("fieldRA",), **columns)).digest == visits.digest
+    with pytest.raises(ProductError, match=r"visits\.csv: columns RA and Ra: expected names that differ in more than"):
+        read_visit_list(write_list(RA=[0.0] * 5, Ra=[0.0] * 5))
+
+
+@pytest.mark.parametrize(("scale", "form"), [("utc", "isot"), ("tai", "mjd"), ("tdb", "jd")])
+def test_times_of_fits(visits, tmp_path, scale, form):
+    """Coordinates by the FITS standard, as astropy writes times; lists with them were said to have no time."""
+    table = QTable({name: column(name) for name in COLUMNS})
+    times = getattr(Time(column("observationStartMJD"), format="mjd", scale="tai"), scale)
+    table["observationStartMJD"] = Time(times, format=form)
+    path = tmp_path / "visits.fits"
+    table.write(path)
+    # A microsecond, by which TDB is that of no place on the Earth.
+    same_visits(read_visit_list(path), visits, tolerance=1e-9)
 
 
 def test_times_and_positions_of_astropy(visits, tmp_path):

@@ -66,6 +66,17 @@ def test_photometry_of_a_visit(experiment):
     assert columns["weight"] == pytest.approx(1 / (variance * 10 ** (0.8 * (31.4 - zero_point))))
 
 
+def test_a_configuration_of_a_visit_starts_another(experiment):
+    """The two snaps of the first were in its read noise and full well again: 17.6 e for 12.4, of one snap 12.4."""
+    for snaps in (2, 1):
+        again, first = (
+            visit_experiment(config, listed(snaps=snaps)).config.photometry
+            for config in (experiment.config, configuration_of({"ccds": ["R22_S11"]}, "test"))
+        )
+        assert again.read_noise_e == pytest.approx(first.read_noise_e, rel=1e-14)
+        assert again.full_well_e == pytest.approx(first.full_well_e, rel=1e-14)
+
+
 @pytest.mark.parametrize("given", [{}, {"brightest": 16.0}])
 def test_limits_of_a_catalogue_are_those_of_the_sky_and_snaps(tmp_path, given):
     """They were those of a dark sky and one snap."""

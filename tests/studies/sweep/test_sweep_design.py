@@ -61,6 +61,54 @@ def test_more_monte_carlo_points_leave_the_first_as_they_are():
     assert design_points(sweep("monte_carlo", points=50))[:20] == design_points(sweep("monte_carlo", points=20))
 
 
+@pytest.mark.parametrize(
+    ("points", "epochs"), [(2, [0, 5]), (4, [0, 2, 3, 5]), (5, [0, 1, 3, 4, 5]), (50, [0, 1, 2, 3, 4, 5])]
+)
+def test_keys_of_whole_numbers_have_these_alone(points, epochs):
+    """Values of a range were 0.0, 1.25, 2.5..., of which the first was refused already."""
+    parameters = {"atmosphere.epoch": {"nominal": 0, "range": [0, 5]}}
+    grid = sweep("grid", parameters, points=points)
+    values = [point["atmosphere.epoch"] for point in design_points(grid)]
+    assert values == epochs
+    assert {type(value) for value in values} == {int}
+    assert point_count(grid) == len(epochs)
+
+
+@pytest.mark.parametrize("kind", ["monte_carlo", "latin_hypercube", "sobol"])
+def test_random_whole_numbers_are_evenly_likely(kind):
+    parameters = {"seed": {"range": [3, 6]}, "stars.truth": {"normal": [100, 2]}}
+    seeds, counts = np.array([[*p.values()] for p in design_points(sweep(kind, parameters, points=512, seed=3))]).T
+    assert seeds.dtype.kind == counts.dtype.kind == "i"
+    # 128 each; four standard deviations of a binomial distribution.
+    assert np.abs(np.bincount(seeds)[3:] - 128).max() < 4 * np.sqrt(512 * 0.25 * 0.75)
+    # Rounded, a variance of 4 grows by 1/12.
+    assert counts.std() == pytest.approx(np.sqrt(4 + 1 / 12), rel=0.15)
+
+
+@pytest.mark.parametrize("kind", ["grid", "one_at_a_time", "latin_hypercube"])
+def test_sides_of_stamps_are_odd(kind):
+    """Half of the points had even ones, which are refused."""
+    parameters = {"psf.stamp": {"nominal": 41, "range": [31, 51]}}
+    stamps = [point["psf.stamp"] for point in design_points(sweep(kind, parameters, points=7))]
+    assert (min(stamps), max(stamps)) == (31, 51)
+    assert {stamp % 2 for stamp in stamps} == {1}
+    assert point_count(sweep("grid", parameters, points=99)) == 11
+    with pytest.raises(ConfigError, match=r"parameters.psf.stamp.range\[1\] = 50: expected an odd number"):
+        sweep(kind, {"psf.stamp": {"nominal": 41, "range": [31, 50]}})
+
+
+def test_nominal_values_and_marks_of_whole_numbers(tmp_path):
+    parameters = {"psf.stamp": {"nominal": 41.0, "values": [31.0, 51], "marks": {"wide": 61}}}
+    stamps = [p["psf.stamp"] for p in design_points(sweep("one_at_a_time", parameters))]
+    assert [repr(stamp) for stamp in stamps] == ["41", "31", "51", "61"]
+    Table({"psf.stamp": [31.0, 41.0]}).write(tmp_path / "points.ecsv")
+    table = read_sweep({"design": {"kind": "table", "file": str(tmp_path / "points.ecsv")}}, "test")
+    assert repr(design_points(table)) == "[{'psf.stamp': 31}, {'psf.stamp': 41}]"
+    for key, value in (("range", [0.5, 3.0]), ("marks", {"a": 2.5})):
+        with pytest.raises(ConfigError, match=rf"parameters\.seed\.{key}.* = .\.5: expected a whole number"):
+            sweep("grid", {"seed": {"nominal": 0, "range": [0, 3], key: value}})
+
+
 def test_points_come_from_a_table(tmp_path):
     Table({"a": [1.0, 2.5], "c": ["g", "i"]}).write(tmp_path / "points.ecsv")
     (tmp_path / "sweep.yaml").write_text("design: {kind: table, file: points.ecsv}\n")

@@ -6,17 +6,21 @@ from astropy.io import fits
 from astropy.table import Table
 from visit_rows import COLUMNS, ROWS
 
+from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, ProductError
 from pachon.core.long_work import Execution
+from pachon.models.io.bundled import DATA
+from pachon.models.io.site_file import load_site
+from pachon.pipeline.config import Configuration
 from pachon.sky.pointing import Pointing
 from pachon.sky.visit_list.read_list import read_visit_list
 from pachon.studies.night import config as night_config
-from pachon.studies.night.config import ListSection
+from pachon.studies.night.config import ListSection, read_section
 from pachon.studies.visits.plan import listed_plan
 from pachon.studies.visits.psf_visit import VisitPsfs
 from pachon.studies.visits.stack import PsfSums
 from pachon.studies.visits.visit_figures import VisitFigures
-from pachon.studies.visits.visits import SUMS_NAME, stack_visits
+from pachon.studies.visits.visits import SUMS_NAME, claim_visits, stack_visits
 
 
 @pytest.fixture
@@ -50,11 +54,11 @@ def test_sums_have_weights():
 
 def test_lists_of_several_bands_or_fields_are_no_stack(visits_config, list_file, tmp_path):
     with pytest.raises(ConfigError, match="bands i, r, z: expected one for a stack"):
-        visits_config().with_list(ListSection(list=str(list_file)))
+        visits_config(count=10).with_list(ListSection(list=str(list_file)))
     far = tmp_path / "far.csv"
     far.write_text(list_file.read_text().replace("53.25,-27.9", "73.25,-27.9"))
     with pytest.raises(ConfigError, match="expected one field"):
-        visits_config().with_list(ListSection(list=str(far), band="r"))
+        visits_config(count=10).with_list(ListSection(list=str(far), band="r"))
 
 
 def test_a_list_is_read_once_while_it_stays_the_same(visits_config, list_file, monkeypatch, tmp_path):
@@ -66,7 +70,7 @@ def test_a_list_is_read_once_while_it_stays_the_same(visits_config, list_file, m
         return read_visit_list(*arguments, **options)
 
     monkeypatch.setattr(night_config, "read_visit_list", read)
-    config = visits_config().with_list(ListSection(list=str(path), band="r"))
+    config = visits_config(count=10).with_list(ListSection(list=str(path), band="r"))
     assert len(config.plan(1)) == config.visits.count
     assert len(readings) == 1
     path.write_text(list_file.read_text().replace("53.25,-27.9", "53.2501,-27.9"))
@@ -75,11 +79,28 @@ def test_a_list_is_read_once_while_it_stays_the_same(visits_config, list_file, m
     assert len(readings) == 2
 
 
+def test_a_list_that_has_moved_goes_on(visits_config, list_file, tmp_path):
+    """The path of the list made another stack of the same visits; a night went on."""
+    moved = tmp_path / "elsewhere" / "new_name.csv"
+    moved.parent.mkdir()
+    moved.write_text(list_file.read_text())
+    old = visits_config(count=10).with_list(ListSection(list=str(list_file), band="r"))
+    new = visits_config(count=10).with_list(ListSection(list=str(moved), where="band = 'r'"))
+    other = visits_config(count=10).with_list(ListSection(list=str(moved), where="band = 'r' and observationId > 1001"))
+    experiment = old.experiment()
+    assert new.digest(experiment) == old.digest(experiment) != other.digest(experiment)
+    claim_visits(tmp_path / "stack", old, resume=False)
+    claim_visits(tmp_path / "stack", new, resume=True)
+    assert str(moved) in (tmp_path / "stack" / "config.yaml").read_text()
+    with pytest.raises(ProductError, match=r"stack holds visits of another list: .*new_name.csv has changed, or other"):
+        claim_visits(tmp_path / "stack", other, resume=True)
+
+
 @pytest.mark.long
 @pytest.mark.usefixtures("empty_pictures")
 def test_a_stack_of_a_list(visits_config, list_file, tmp_path):
     section = ListSection(list=str(list_file), band="r", where="observationId < 1003")
-    config = visits_config(snapshots=(1,)).with_list(section)
+    config = visits_config(count=10, snapshots=(1,)).with_list(section)
     assert config.visits.count == 2
     assert config.run.atmosphere.exposure_s == 30.0
     result = stack_visits(config, tmp_path / "one", execution=Execution(threads=1))
@@ -98,3 +119,54 @@ def test_a_stack_of_a_list(visits_config, list_file, tmp_path):
     assert sums.max() > 0.0
     for weight in sums:
         assert np.isclose(weight, [0.0, one, two, one + two], rtol=1e-6, atol=0.0).any()
+
+
+def test_the_place_of_a_telescope_without_a_site_is_said(list_file, tmp_path):
+    """It was that of Cerro Pachon without a word; a site of its own file was refused as an unknown one."""
+    text = (DATA / "lsst_v3.3_r.yaml").read_text()
+    (tmp_path / "air.yaml").write_text((DATA / "maunakea.yaml").read_text())
+    assumed = "telescope mine.yaml has no bundled site: place of cerro_pachon is taken"
+    for site, place, scale, remarks in (
+        ("", "cerro_pachon", 25.0, [assumed]),
+        ("site: air.yaml\n", "cerro_pachon", float(load_site("maunakea").outer_scale), [assumed]),
+        ("site: cerro_tololo\n", "cerro_tololo", float(load_site("cerro_tololo").outer_scale), []),
+    ):
+        (tmp_path / "mine.yaml").write_text(site + text)
+        section = ListSection(list=str(list_file), where="observationId = 1004")
+        listed = read_section(section, Configuration(telescope="mine.yaml"), tmp_path)
+        expected = read_visit_list(list_file, where="observationId = 1004", site=place, outer_scale=scale)
+        assert (listed.digest, [*listed.remarks]) == (expected.digest, [*expected.remarks, *remarks])
+
+
+def test_a_list_of_a_configuration_in_another_folder(visits_config, list_file, tmp_path, capsys, monkeypatch):
+    """Its telescope was looked for in the current one; a list under visits.from_list had neither band nor pointing."""
+    folder = tmp_path / "settings"
+    folder.mkdir()
+    (folder / "mine_r.yaml").write_text((DATA / "lsst_v3.3_r.yaml").read_text())
+    base = visits_config(count=10)
+    base = base.model_copy(update={"run": base.run.model_copy(update={"telescope": "mine_r.yaml"})})
+    config = base.with_list(ListSection(list="../visits.csv", band="r"), folder)
+    assert config.experiment(folder).telescope.name == "lsst_v3.3_r"
+    expected = visits_config(count=10).with_list(ListSection(list=str(list_file), band="r"))
+    assert config.visits == expected.visits
+    stacked = []
+
+    def stack(config, *_, **__):
+        stacked.append(config)
+        raise ConfigError("no stack is wanted")
+
+    monkeypatch.setattr("pachon.studies.visits.visits.stack_visits", stack)
+    text = "run: {ccds: [R22_S11], telescope: mine_r.yaml}\nvisits: {from_list: {list: ../visits.csv, band: r}}\n"
+    (folder / "stack.yaml").write_text(text)
+    for options in ([], ["--count", "2"]):
+        assert main(["visits", str(folder / "stack.yaml"), *options]) == 2
+    assert "visits.count: expected none with a list, whose visits have their own" in capsys.readouterr().err
+    assert stacked[0].visits.from_list == expected.visits.from_list
+    assert stacked[0].run.pointing == expected.run.pointing
+
+
+@pytest.mark.parametrize("key", [{"count": 3}, {"dither_deg": 1.0}, {"roll_deg": (0.0,)}, {"first_epoch": 2}])
+def test_settings_of_drawn_visits_are_refused_beside_a_list(visits_config, list_file, key):
+    """They were ignored."""
+    with pytest.raises(ConfigError, match=rf"visits.{next(iter(key))}: expected none with a list"):
+        visits_config(**{"count": 10} | key).with_list(ListSection(list=str(list_file), band="r"))
