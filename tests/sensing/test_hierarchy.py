@@ -8,7 +8,7 @@ import pytest
 from pachon.models.zernike_polynomials import annular_zernikes, noll_to_nm
 from pachon.sensing.air_shape import air_shape
 from pachon.sensing.contradicting_donuts import fit_consistently
-from pachon.sensing.hierarchy import Basis, ExposureAir, Observations, fit_hierarchy, star_numbers
+from pachon.sensing.hierarchy import Basis, ExposureAir, Observations, Sizes, _Model, fit_hierarchy, star_numbers
 
 NOLL = np.arange(4, 12)
 #: Part of the air that donuts share.
@@ -160,3 +160,24 @@ def test_donuts_of_one_star_stand_within_a_distance_or_have_one_name():
     fields = np.array([[0.0, 0.0], [1e-3, 0.0], [1e-5, 0.0], [1e-3, 1e-5]])
     assert star_numbers(fields, 1e-4).tolist() == [0, 1, 0, 1]
     assert star_numbers(fields, 1e-4, [7, 7, 3, 3]).tolist() == [1, 1, 0, 0]
+
+
+@pytest.mark.parametrize("donuts_of_a_star", [1, 2])
+def test_slopes_of_the_loss_are_those_of_differences(donuts_of_a_star):
+    """By the logarithm of each size: a search by differences takes seven times as many evaluations."""
+    rng = np.random.default_rng(5)
+    places = np.repeat(places_of(rng, 4), donuts_of_a_star, axis=0)
+    star = np.repeat(np.arange(4), donuts_of_a_star)
+    exposure = np.arange(len(star)) % donuts_of_a_star
+    observations, _, _ = drawn(rng, places, star=star, exposure=exposure, air=60e-9, local=20e-9)
+    model = _Model(observations, field_basis(places), ExposureAir(shape(), GROUND))
+    at, step = np.log([1.3, 90e-9, 120e-9, np.log(3.5), 6e-9, 12e-9]), 1e-4
+
+    def loss(logarithms):
+        return model.loss(Sizes.of(logarithms))[0]
+
+    differences = [(loss(at + unit) - loss(at - unit)) / (2.0 * step) for unit in step * np.eye(6)]
+    slopes = model.loss(Sizes.of(at))[1]
+    assert np.abs(slopes).min() > 0.01
+    # Second-order differences at this step are off by 1e-7 of the larger slopes.
+    np.testing.assert_allclose(slopes, differences, rtol=1e-6, atol=1e-5)
