@@ -437,8 +437,9 @@ class _Model:
 def _root_of_inverse(matrix: np.ndarray) -> np.ndarray | None:
     """Return a triangular root whose transpose times itself is the inverse of a positive matrix; None if it is not."""
     scale = 1.0 / np.sqrt(np.diag(matrix))
-    factor, failed = lapack.dpotrf(matrix * np.outer(scale, scale), lower=1, clean=1)
-    return None if failed else np.asarray(lapack.dtrtri(factor, lower=1)[0] * scale)
+    # Of a symmetric matrix the transpose is in the order of LAPACK, without a copy.
+    factor, failed = lapack.dpotrf((matrix * np.outer(scale, scale)).T, lower=1, clean=1, overwrite_a=1)
+    return None if failed else np.asarray(lapack.dtrtri(factor, lower=1, overwrite_c=1)[0] * scale)
 
 
 def star_numbers(fields: np.ndarray, within: float, names: Sequence[int] | None = None) -> np.ndarray:
