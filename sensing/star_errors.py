@@ -93,12 +93,16 @@ class StarErrors:
     figure : ndarray, shape [n_noll, n_noll]
         What stars have in common: the telescope's terms beside those asked for, fitted with a prior or not, and the
         accuracy of the model.
+    air_losses : ndarray, shape [n_rms], optional
+        What the residuals say of the air: twice the negative logarithm of the likelihood of its rms, at
+        :data:`~pachon.sensing.residual_patterns.RMS_LOGARITHMS` in units of 100 nm.
     """
 
     covariance: np.ndarray
     parts: ErrorParts
     of_light: np.ndarray
     figure: np.ndarray
+    air_losses: np.ndarray | None = None
 
 
 def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
@@ -110,6 +114,7 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     wavefront = slice(n_star, n_star + n)
     photons, air = solution.covariance, terms.air
     figure, by_prior, speckled = np.zeros((3, n, n))
+    air_losses = None
     residuals, lacking = np.zeros_like(photons), solution.star_covariance(0).copy()
     point = linearized(star.stamp, solution.stars[0], solution.waves[0])
     if point is not None and len(solution.shared):
@@ -123,7 +128,7 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
             beside.unfitted,
             precision * deviation,
         )
-        residuals = power.covariance
+        residuals, air_losses = power.covariance, power.losses
         lacking += residuals[:n_star, :n_star]
         figure = beside.figure(photons)[wavefront, wavefront]
         # What a prior about zero takes from the telescope's further terms goes into those asked for.
@@ -144,7 +149,7 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
         of_noise = of_noise + star.steps.covariance[wavefront, wavefront]
     parts = ErrorParts.of(of_noise, of_residuals, air, figure + accuracy)
     of_light = parts.photons - by_prior + parts.residuals + speckled
-    return StarErrors(lacking, parts, of_light, figure + by_prior + accuracy)
+    return StarErrors(lacking, parts, of_light, figure + by_prior + accuracy, air_losses)
 
 
 def by_rivals(star: StarSolution, n: int) -> np.ndarray:
