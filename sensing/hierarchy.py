@@ -19,11 +19,16 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 from scipy.linalg import lapack
 from scipy.optimize import minimize
 
+from .residual_patterns import AIR_UNIT, RMS_LOGARITHMS
+
 #: Rms of the air's wavefront about which its prior lies, that of 15 s under median seeing, Z4 to Z22 [m].
 AIR_RMS = 110e-9
+#: Rms of the air at which residuals of images say how likely it is [m].
+RMS = AIR_UNIT * np.exp(RMS_LOGARITHMS)
 #: Largest air that can be told from wavefronts that have nothing in common [m].
 MOST_AIR = 3e-6
 #: Standard deviation of the logarithm of the air's variance, and of those of the telescope.
@@ -85,11 +90,23 @@ class ExposureAir:
         Part of it that all donuts of the exposure share.
     rms : float, optional
         Rms, Z4 to Z22 [m]; fitted by default.
+    losses : ndarray, shape [n_rms], optional
+        What residuals of the images say of this: twice the negative logarithm of the likelihood at :data:`RMS`.
     """
 
     shape: np.ndarray
     shared: float
     rms: float | None = None
+    losses: np.ndarray | None = None
+
+    def loss(self, logarithm: float) -> tuple[float, float]:
+        """Return what residuals say of the logarithm of an rms, and its slope; nothing below the least one."""
+        if self.losses is None:
+            return 0.0, 0.0
+        inside = float(np.clip(logarithm, *np.log(RMS[[0, -1]])))
+        curve = PchipInterpolator(np.log(RMS), self.losses)
+        slope = float(curve(inside, 1)) if logarithm >= inside else 0.0
+        return float(curve(inside)) + slope * (logarithm - inside), slope
 
 
 @dataclass(frozen=True)
@@ -229,8 +246,12 @@ def fit_hierarchy(observations: Observations, basis: Basis, air: ExposureAir) ->
 
     def loss(values: np.ndarray) -> tuple[float, np.ndarray]:
         deviation = (values - middle[index]) / spread[index]
-        of_model, slopes = model.loss(sizes(values))
-        return of_model + float(deviation @ deviation), slopes[index] + 2.0 * deviation / spread[index]
+        parts = sizes(values)
+        of_model, slopes = model.loss(parts)
+        of_residuals, slope = air.loss(math.log(parts.air))
+        slopes[1] += slope
+        total = of_model + of_residuals + float(deviation @ deviation)
+        return total, slopes[index] + 2.0 * deviation / spread[index]
 
     bounds = list(zip(least[index], most[index], strict=True))
     best = minimize(loss, middle[index], jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 40})

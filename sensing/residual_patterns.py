@@ -14,13 +14,18 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
+from scipy.special import logsumexp
 
+#: Rms of the wavefront of air of unit strength, Z4 to Z22 together [m].
+AIR_UNIT = 1e-7
 #: Logarithms of the rms of the field at which its likelihood is computed, in units of itself: 3 nm to 1 um of air.
 RMS_LOGARITHMS = np.linspace(math.log(0.03), math.log(10.0), 30)
 #: Logarithm of the rms about which its prior lies, that of air in 15 s under median seeing, and its standard deviation.
 _USUAL, _WIDE = math.log(1.1), 1.0
 #: Probability beforehand that there is next to none: images of telescopes in space, or made without air.
 _NONE = 0.1
+#: Parts of the power that telescopes are expected to have in further terms: of well figured ones there is next to none.
+_PARTS = (0.0, 0.2, 1.0)
 #: Loss of the logarithm of the likelihood by a level that is fitted.
 _WORTH = 2.0
 #: Levels that are tried.
@@ -70,29 +75,43 @@ class Patterns:
         amplitudes = self.columns.T @ patterns
         return np.asarray(amplitudes @ amplitudes.T, dtype=np.float64)
 
-    def sizes(self, power: np.ndarray) -> PatternSizes:
+    def sizes(self, others: np.ndarray, expected: np.ndarray) -> PatternSizes:
         """Return the strength of the field, the surplus of the variance in all combinations alike, and losses.
 
-        Means are over all rms of the field, without a level and with the best one. Losses are twice the negative
-        logarithm of the likelihood at :data:`RMS_LOGARITHMS`. Other fields have a power [m, m] in the amplitudes.
+        Strength and surplus are means over all rms of the field, without a level and with the best one, for all of what
+        is expected: one donut hardly tells less of it from air. Losses, which several tell together, are over parts of
+        it, too: twice the negative logarithm of the likelihood at :data:`RMS_LOGARITHMS`.
+
+        Parameters
+        ----------
+        others : ndarray, shape [m, m]
+            Power of other fields in the amplitudes.
+        expected : ndarray, shape [m, m]
+            The same of what a telescope is expected to have, or less.
         """
-        count = len(self.variances)
         strengths = np.exp(2.0 * RMS_LOGARITHMS)
-        if not count:
+        if not len(self.variances):
             return PatternSizes(0.0, 0.0, np.zeros(len(strengths)))
-        variances, vectors = eigh(np.diag(self.variances), np.eye(count) + power)
+        losses, surplus = np.moveaxis([self._losses(others + part * expected) for part in _PARTS], 1, 0)
+        prior = np.exp(-0.5 * ((RMS_LOGARITHMS - _USUAL) / _WIDE) ** 2)
+        prior[0] += _NONE / (1.0 - _NONE) * prior.sum()
+        of_all = losses[-1]
+        posterior = prior * np.exp(of_all.min() - of_all)
+        posterior /= posterior.sum()
+        of_rms = -2.0 * logsumexp(-losses, axis=(0, 1))
+        return PatternSizes(float((posterior * strengths).sum()), float((posterior * surplus[-1]).sum()), of_rms)
+
+    def _losses(self, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return losses without and with a level by the rms of the field, and the level, each [2, n_rms]."""
+        count, strengths = len(self.variances), np.exp(2.0 * RMS_LOGARITHMS)
+        base = np.eye(count) + power
+        variances, vectors = eigh(np.diag(self.variances), base)
         energies = (vectors.T @ self.amplitudes) ** 2
         # Up to beyond the logarithm of their mean square, where the field lowers the level.
         levels = np.exp(np.linspace(0.0, math.log(max(float(energies.mean()), 1.0)) + 1.0, _LEVELS))
         of_field = strengths[:, None] * variances
         total = levels[:, None, None] + of_field
-        losses = 0.5 * (np.log(total) + energies / total).sum(axis=2)
-        losses = np.stack([losses[0], losses[1:].min(axis=0) + _WORTH])
+        losses = 0.5 * ((np.log(total) + energies / total).sum(axis=2) + np.linalg.slogdet(base)[1])
         # What lies far out is part of the level.
-        surplus = np.stack([np.zeros(len(strengths)), np.maximum((energies - of_field).mean(axis=1) - 1.0, 0.0)])
-        prior = np.exp(-0.5 * ((RMS_LOGARITHMS - _USUAL) / _WIDE) ** 2)
-        prior[0] += _NONE / (1.0 - _NONE) * prior.sum()
-        posterior = prior * np.exp(losses.min() - losses)
-        posterior /= posterior.sum()
-        of_rms = -2.0 * np.logaddexp(*-losses)
-        return PatternSizes(float((posterior * strengths).sum()), float((posterior * surplus).sum()), of_rms)
+        surplus = np.maximum((energies - of_field).mean(axis=1) - 1.0, 0.0)
+        return np.stack([losses[0], losses[1:].min(axis=0) + _WORTH]), np.stack([np.zeros(len(strengths)), surplus])

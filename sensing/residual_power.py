@@ -143,7 +143,7 @@ def residual_power(
     if beside is None:
         return ResidualPower(root, inner)
     known = np.zeros_like(of_patterns) if expected is None else beside.power_of(squares.of(expected))
-    sizes = beside.sizes(of_patterns + known)
+    sizes = beside.sizes(of_patterns, known)
     return ResidualPower(root, inner + sizes.level * (np.eye(n) + inner), sizes.strength, sizes.losses)
 
 

@@ -16,6 +16,7 @@ from pachon.sensing.air_shape import air_shape
 from pachon.sensing.cross_check import cross_checked
 from pachon.sensing.likelihood import Linearized
 from pachon.sensing.noise import measured_noise
+from pachon.sensing.residual_patterns import RMS_LOGARITHMS, Patterns
 from pachon.sensing.residual_power import residual_power
 from pachon.sensing.rim_search import power_of_squares
 from pachon.sensing.star_errors import ErrorParts
@@ -198,6 +199,21 @@ def test_scatter_of_donuts_beyond_their_errors_is_air_of_which_they_share_a_part
     unrelated = rng.normal(0.0, 300e-9 / np.sqrt(19), (30, 19))
     apart = cross_checked(fields, unrelated, [parts_of(20e-9)] * 30, one_side, lambda: np.eye(19) / 19, shared=GROUND)
     assert np.sqrt(np.trace(apart[0].total)) == pytest.approx(20e-9)
+
+
+@pytest.mark.parametrize(("rms", "further"), [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (1.0, 0.2)])
+def test_air_is_told_from_what_telescopes_have_by_how_it_falls_off(rms, further):
+    """Amplitudes drawn: the likeliest rms is that of the air, however much less the telescope has than expected."""
+    rng = np.random.default_rng(9)
+    # Air falls off faster with the order than what telescopes have.
+    variances, expected = 10.0 * np.arange(1.0, 41.0) ** -1.5, np.diag(4.0 * np.arange(1.0, 41.0) ** -0.5)
+    spread = np.sqrt(1.0 + rms**2 * variances + further * np.diag(expected))
+    sizes = [
+        Patterns(np.zeros((0, 40)), rng.normal(0.0, spread), variances).sizes(np.zeros((40, 40)), expected)
+        for _ in range(20)
+    ]
+    likeliest = RMS_LOGARITHMS[np.argmin(np.sum([size.losses for size in sizes], axis=0))]
+    assert np.exp(likeliest) == pytest.approx(rms, rel=0.2) if rms else likeliest < np.log(0.2)
 
 
 def test_donuts_of_one_exposure_claim_one_air():
