@@ -14,7 +14,7 @@ from .first_search import first_solution
 from .flags import DonutFlag
 from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y
 from .light import Instrument, StarLight
-from .likelihood import Stamp, model_image
+from .likelihood import Stamp, model_image, pixel_variance
 from .neighbours import NeighbourSearch
 from .noise import AssumedElectron
 from .other_side import MISFIT, POOR, OtherSide, misfit_of
@@ -23,7 +23,7 @@ from .sides import BothSides
 from .solve import COARSE, Solution
 from .stamps import Pixels, plane_basis
 from .star_fitter import BRIGHT, StarFitter, StarSolution, Start
-from .undetermined import is_faint, is_hopeless
+from .undetermined import is_faint, is_hidden, is_hopeless
 
 #: Signal over noise of a donut above a plane background of any level; the noise of a sky reaches 4 somewhere on a
 #: stamp.
@@ -46,6 +46,9 @@ _MASKED = 0.4
 _DARK = 0.01
 #: Sizes of donuts over that of the telescope's own between which nothing is said of them: by 120 um of 1500 of defocus.
 _SIZES = (0.92, 1.08)
+#: Motion of the light by the wavefront over the size of the donut, both rms, from which on something is no donut, and
+#: that of something whose loss a pixel is above a limit: stars in focus have 0.8 to 1.1, a donut half as large 0.5.
+_MOVED, _MOVED_BADLY, _BADLY = 0.7, 0.5, 1.2
 #: Largest part of the light that rims which have run away make less than none: a star in focus, for which the fit moved
 #: the rim of M2 by 3 m, has 0.07.
 _NEGATIVE = 0.03
@@ -255,12 +258,15 @@ def _finished(
         return StarFit(DonutFlag.MOSTLY_LOST)
     if lost.regions > _CUT_OFF:
         flags |= DonutFlag.CUT_OFF
-    if not _is_between(_size(finest.stamp, finest.solution), _SIZES):
+    size = _size(finest.stamp, finest.solution)
+    if not _is_between(size, _SIZES):
         flags |= DonutFlag.OTHER_SIZE
     if sides is not None and sides.ambiguous:
         flags |= DonutFlag.AMBIGUOUS_SIDE
     if electron is not None and flags.usable:
         finest, unit = fitter.with_measured_noise(finest, electron)
+    if fitter.donut and _is_no_donut(finest, size, len(fitter.instrument.terms.requested)):
+        return StarFit(DonutFlag.NO_DONUT | (flags & DonutFlag.OTHER_SIZE))
     return StarFit(flags, finest, unit, sides=sides, preliminary=preliminary)
 
 
@@ -421,6 +427,32 @@ def _size(stamp: Stamp, solution: Solution) -> float:
         return float(np.sqrt(weights @ ((landing - weights @ landing) ** 2).sum(axis=1)))
 
     return radius(stamp.rays.landing(wave)) / max(radius(stamp.rays.landing(np.zeros_like(wave))), 1e-12)
+
+
+def _is_no_donut(star: StarSolution, size: float, n_term: int) -> bool:
+    """Return whether a fit of so many terms, of a relative size, is of something else, or of what is beside that."""
+    stamp, solution = star.stamp, star.solution
+    motion, badly = _motion(stamp, solution), misfit_of(stamp, solution) > _BADLY
+    if motion > _MOVED or (badly and (motion > _MOVED_BADLY or not _is_between(size, _LIKE_DONUTS))):
+        return True
+    unknowns = solution.stars[0].copy()
+    unknowns[FLUX] = 0.0
+    light = star.model - model_image(star.full, unknowns, solution.waves[0])
+    squares = light**2 / pixel_variance(star.full, star.model)
+    # All that stood out at the start may have been left out as no part of a donut.
+    return is_hidden(float(np.sqrt(squares[star.full.used].sum())), n_term)
+
+
+def _motion(stamp: Stamp, solution: Solution) -> float:
+    """Return how far a wavefront moves the light of a donut, over its size without, both rms."""
+    wave = solution.waves[0]
+    weights, straight = stamp.rays.weights(wave), stamp.rays.landing(np.zeros_like(wave))
+
+    def mean_square(landing: np.ndarray) -> float:
+        return float(weights @ ((landing - weights @ landing) ** 2).sum(axis=1))
+
+    moved, size = mean_square(stamp.rays.landing(wave) - straight), mean_square(straight)
+    return float(np.sqrt(max(moved, 0.0) / max(size, 1e-24)))
 
 
 def _explained(stamp: Stamp, solution: Solution) -> bool:

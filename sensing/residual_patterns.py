@@ -23,7 +23,7 @@ RMS_LOGARITHMS = np.linspace(math.log(0.03), math.log(10.0), 30)
 #: Logarithm of the rms about which its prior lies, that of air in 15 s under median seeing, and its standard deviation.
 _USUAL, _WIDE = math.log(1.1), 1.0
 #: Probability beforehand that there is next to none: images of telescopes in space, or made without air.
-_NONE = 0.1
+_NONE = 0.2
 #: Parts of the power that telescopes are expected to have in further terms: of well figured ones there is next to none.
 _PARTS = (0.0, 0.2, 1.0)
 #: Loss of the logarithm of the likelihood by a level that is fitted.
