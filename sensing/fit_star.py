@@ -46,9 +46,12 @@ _MASKED = 0.4
 _DARK = 0.01
 #: Sizes of donuts over that of the telescope's own between which nothing is said of them: by 120 um of 1500 of defocus.
 _SIZES = (0.92, 1.08)
-#: Motion of the light by the wavefront over the size of the donut, both rms, from which on something is no donut, and
-#: that of something whose loss a pixel is above a limit: stars in focus have 0.8 to 1.1, a donut half as large 0.5.
-_MOVED, _MOVED_BADLY, _BADLY = 0.7, 0.5, 1.2
+#: Motion of the light by the wavefront over the size of the donut, both rms, from which on something is no donut: stars
+#: in focus have 0.8 to 1.1.
+_MOVED = 0.7
+#: The same of something that fits badly, and its loss a pixel: a donut half as large has 0.5.
+_MOVED_BADLY = 0.5
+_BADLY = 1.2
 #: Largest part of the light that rims which have run away make less than none: a star in focus, for which the fit moved
 #: the rim of M2 by 3 m, has 0.07.
 _NEGATIVE = 0.03

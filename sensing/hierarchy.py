@@ -388,9 +388,9 @@ class _Model:
         n_star, size = group.shape
         design = self._design[group].reshape(n_star, size * self._n, -1)
         weighted = inverse @ design
-        seen = (weighted.reshape(-1, weighted.shape[2]) @ root.T).reshape(weighted.shape)
+        determined = (weighted.reshape(-1, weighted.shape[2]) @ root.T).reshape(weighted.shape)
         residual = self._values[group].reshape(n_star, -1) - design @ terms
-        return inverse - seen @ np.swapaxes(seen, 1, 2), np.einsum("gab,gb->ga", inverse, residual)
+        return inverse - determined @ np.swapaxes(determined, 1, 2), np.einsum("gab,gb->ga", inverse, residual)
 
     def chi2_by_the_others(self, sizes: Sizes) -> np.ndarray:
         """Return chi-square a term of each donut's star about what other stars say of it, shape [n]."""

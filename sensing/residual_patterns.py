@@ -21,7 +21,8 @@ AIR_UNIT = 1e-7
 #: Logarithms of the rms of the field at which its likelihood is computed, in units of itself: 3 nm to 1 um of air.
 RMS_LOGARITHMS = np.linspace(math.log(0.03), math.log(10.0), 30)
 #: Logarithm of the rms about which its prior lies, that of air in 15 s under median seeing, and its standard deviation.
-_USUAL, _WIDE = math.log(1.1), 1.0
+_USUAL = math.log(1.1)
+_WIDE = 1.0
 #: Probability beforehand that there is next to none: images of telescopes in space, or made without air.
 _NONE = 0.2
 #: Parts of the power that telescopes are expected to have in further terms: of well figured ones there is next to none.
@@ -92,7 +93,7 @@ class Patterns:
         strengths = np.exp(2.0 * RMS_LOGARITHMS)
         if not len(self.variances):
             return PatternSizes(0.0, 0.0, np.zeros(len(strengths)))
-        losses, surplus = np.moveaxis([self._losses(others + part * expected) for part in _PARTS], 1, 0)
+        losses, surplus = np.moveaxis([self._losses(others + share * expected) for share in _PARTS], 1, 0)
         prior = np.exp(-0.5 * ((RMS_LOGARITHMS - _USUAL) / _WIDE) ** 2)
         prior[0] += _NONE / (1.0 - _NONE) * prior.sum()
         of_all = losses[-1]

@@ -142,8 +142,8 @@ def residual_power(
         inner, of_patterns = residuals.power(n)
     if beside is None:
         return ResidualPower(root, inner)
-    known = np.zeros_like(of_patterns) if expected is None else beside.power_of(squares.of(expected))
-    sizes = beside.sizes(of_patterns, known)
+    of_telescope = np.zeros_like(of_patterns) if expected is None else beside.power_of(squares.of(expected))
+    sizes = beside.sizes(of_patterns, of_telescope)
     return ResidualPower(root, inner + sizes.level * (np.eye(n) + inner), sizes.strength, sizes.losses)
 
 

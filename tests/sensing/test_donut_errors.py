@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from astropy import units as u
 from donut_images import PIXEL, WAVELENGTH, donut
 from scipy.ndimage import gaussian_filter
 
@@ -267,6 +268,9 @@ def test_noise_and_unit_of_images_need_not_be_known(behind_focus):
     known_noise = pachon.fit_donuts(behind_focus, stamps[:1], [FIELD], WAVELENGTH, sky_variance=SKY, **OPTIONS)
     assert fit.reasons == ["", ""]
     np.testing.assert_allclose(fit.photon_variance, [1.0, 0.4], rtol=0.15)
+    # Light is in the unit of the images, which no one knows for electrons.
+    assert (known_noise.to_table()["flux"].unit, fit.to_table()["flux"].unit) == (u.electron, u.dimensionless_unscaled)
+    assert "image_units" in " ".join(fit.summary())
     np.testing.assert_allclose(fit.background, [0.0, SKY / 2.5], atol=1.0)
     np.testing.assert_allclose(fit.chi2 / fit.n_pixels, 1.0, atol=0.1)
     for zernikes, errors in zip(fit.zernikes, fit.errors, strict=True):
