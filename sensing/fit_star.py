@@ -268,7 +268,7 @@ def _finished(
         flags |= DonutFlag.AMBIGUOUS_SIDE
     if electron is not None and flags.usable:
         finest, unit = fitter.with_measured_noise(finest, electron)
-    if fitter.donut and _is_no_donut(finest, size, len(fitter.instrument.terms.requested)):
+    if fitter.donut and (_is_no_donut(finest, size) or (flags & DonutFlag.CLIPPED and _is_clipped(fitter, finest))):
         return StarFit(DonutFlag.NO_DONUT | (flags & DonutFlag.OTHER_SIZE))
     return StarFit(flags, finest, unit, sides=sides, preliminary=preliminary)
 
@@ -432,18 +432,20 @@ def _size(stamp: Stamp, solution: Solution) -> float:
     return radius(stamp.rays.landing(wave)) / max(radius(stamp.rays.landing(np.zeros_like(wave))), 1e-12)
 
 
-def _is_no_donut(star: StarSolution, size: float, n_term: int) -> bool:
-    """Return whether a fit of so many terms, of a relative size, is of something else, or of what is beside that."""
-    stamp, solution = star.stamp, star.solution
-    motion, badly = _motion(stamp, solution), misfit_of(stamp, solution) > _BADLY
-    if motion > _MOVED or (badly and (motion > _MOVED_BADLY or not _is_between(size, _LIKE_DONUTS))):
-        return True
-    unknowns = solution.stars[0].copy()
+def _is_no_donut(star: StarSolution, size: float) -> bool:
+    """Return whether a fit of a relative size is of something else, of which it explains a part."""
+    motion, badly = _motion(star.stamp, star.solution), misfit_of(star.stamp, star.solution) > _BADLY
+    return motion > _MOVED or (badly and (motion > _MOVED_BADLY or not _is_between(size, _LIKE_DONUTS)))
+
+
+def _is_clipped(fitter: StarFitter, star: StarSolution) -> bool:
+    """Return whether all that stood out at the start was left out as no part of a donut, and noise is fitted."""
+    unknowns = star.solution.stars[0].copy()
     unknowns[FLUX] = 0.0
-    light = star.model - model_image(star.full, unknowns, solution.waves[0])
+    light = star.model - model_image(star.full, unknowns, star.solution.waves[0])
     squares = light**2 / pixel_variance(star.full, star.model)
-    # All that stood out at the start may have been left out as no part of a donut.
-    return is_hidden(float(np.sqrt(squares[star.full.used].sum())), n_term)
+    significance = float(np.sqrt(squares[star.full.used].sum()))
+    return is_hidden(significance, len(fitter.instrument.terms.requested))
 
 
 def _motion(stamp: Stamp, solution: Solution) -> float:
