@@ -93,14 +93,14 @@ class Patterns:
         strengths = np.exp(2.0 * RMS_LOGARITHMS)
         if not len(self.variances):
             return PatternSizes(0.0, 0.0, np.zeros(len(strengths)))
-        losses, surplus = np.moveaxis([self._losses(others + share * expected) for share in _PARTS], 1, 0)
+        trials = [self._losses(others + share * expected) for share in _PARTS]
+        of_all, surplus = trials[-1]
         prior = np.exp(-0.5 * ((RMS_LOGARITHMS - _USUAL) / _WIDE) ** 2)
         prior[0] += _NONE / (1.0 - _NONE) * prior.sum()
-        of_all = losses[-1]
         posterior = prior * np.exp(of_all.min() - of_all)
         posterior /= posterior.sum()
-        of_rms = -2.0 * logsumexp(-losses, axis=(0, 1))
-        return PatternSizes(float((posterior * strengths).sum()), float((posterior * surplus[-1]).sum()), of_rms)
+        losses = -2.0 * logsumexp([-of_trial for of_trial, _ in trials], axis=(0, 1))
+        return PatternSizes(float((posterior * strengths).sum()), float((posterior * surplus).sum()), losses)
 
     def _losses(self, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return losses without and with a level by the rms of the field, and the level, each [2, n_rms]."""
