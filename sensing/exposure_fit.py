@@ -30,7 +30,7 @@ from .moving_rims import FreeRims
 from .shared_rims import shared_rims
 from .sided_stars import FIELD_NOLL, SAME_STAR, field_basis, sided_stars
 from .sides import SideAgreement, pair_agreement
-from .star_errors import StarErrors, air_of, exposure_air, star_errors
+from .star_errors import StarErrors, air_losses, air_of, exposure_air, star_errors
 from .star_fitter import StarSolution
 from .terms import WavefrontTerms
 from .wavefront_fits import NOLL, FittedStar, FittedStars, UsableStars, WavefrontFit
@@ -107,14 +107,16 @@ class ExposureDonuts(WavefrontFit):
 
         Such a rim is then free for all stars, where they have it together, unless these contradict it.
         """
-        terms, rims = self._terms_with_air(instrument, fitted), FreeRims()
+        terms, rims = self._terms_with_air(instrument, stars, fitted), FreeRims()
         if any(body.moved for star in stars for body in star.light.free_rims.bodies):
             rims = shared_rims(instrument, stars)
         if terms is None and not rims.bodies:
             return None
         return replace(instrument, terms=terms or instrument.terms, free_rims=rims)
 
-    def _terms_with_air(self, instrument: Instrument, fitted: FittedStars) -> WavefrontTerms | None:
+    def _terms_with_air(
+        self, instrument: Instrument, stars: Sequence[StarSolution], fitted: FittedStars
+    ) -> WavefrontTerms | None:
         """Return terms with the higher ones of the air where the scatter of the stars says that there is some."""
         exposure, known = fitted.exposure, instrument.model.air.atmosphere is not None
         if known or exposure is None or exposure.air_rms < _SLIGHT_AIR:
@@ -127,7 +129,8 @@ class ExposureDonuts(WavefrontFit):
         variance[: len(terms.further)] += 1.0 / terms.precision[len(terms.requested) :]
         precision = np.concatenate([np.zeros(len(terms.requested)), 1.0 / variance])
         figure = np.concatenate([terms.figure, np.zeros(len(precision) - len(terms.figure))])
-        return WavefrontTerms(terms.requested, further, precision, figure, terms.air)
+        losses = air_losses(instrument, stars)
+        return WavefrontTerms(terms.requested, further, precision, figure, terms.air, air_losses=losses)
 
     def sided(self, instrument: Instrument, stars: Sequence[StarFit], fields: np.ndarray) -> list[StarFit]:
         """Return the stars with flags by the side of focus that all of them together say."""
@@ -149,7 +152,7 @@ class ExposureDonuts(WavefrontFit):
         exposure = behind.astype(np.int64) if any(paired) else np.zeros(count, dtype=np.int64)
         observations = Observations(zernikes, covariance, star, exposure)
         no_air = instrument.known_seeing and not any(s.solution.stars[0][STRENGTH] for s in usable.stars)
-        air = exposure_air(instrument, 1e-12 if no_air else None)
+        air = exposure_air(instrument, 1e-12 if no_air else None, air_losses(instrument, usable.stars))
         freedoms = None
         double: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
         if self.freedoms is None:

@@ -8,43 +8,34 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..models.zernike_polynomials import noll_to_nm
 from .bad_pixels import without_bad_pixels
 from .donut_rays import ZernikeRays
 from .first_search import first_solution
 from .flags import DonutFlag
 from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, SLOPE_X, SLOPE_Y
 from .light import Instrument, StarLight
-from .likelihood import Stamp, model_image
-from .neighbours import NeighbourSearch, explains_more
+from .likelihood import Stamp, model_image, pixel_variance
+from .neighbours import NeighbourSearch
 from .noise import AssumedElectron
+from .other_side import MISFIT, POOR, OtherSide, misfit_of
 from .rim_search import MOST_BODIES, RimFit, RimSolver, settled, with_another_rim
-from .sides import CONTRADICTED, BothSides, SideFit
+from .sides import BothSides
 from .solve import COARSE, Solution
 from .stamps import Pixels, plane_basis
 from .star_fitter import BRIGHT, StarFitter, StarSolution, Start
-from .undetermined import is_faint, is_hopeless
+from .undetermined import is_faint, is_hidden, is_hopeless
 
 #: Signal over noise of a donut above a plane background of any level; the noise of a sky reaches 4 somewhere on a
 #: stamp.
 _FOUND = 6.0
-#: Loss a coarse pixel from which on the other side of focus is tried; photons leave 0.1, since smoothed noise is small.
-_MISFIT = 0.15
 #: Fraction of the light beside the stamp or on unused regions from which on a donut is cut off.
 _CUT_OFF = 0.05
 #: Fraction of the light beside the stamp or on unused pixels from which on a donut is lost: a little more than half.
 _LOST = 0.55
-#: Steps of the fit on the other side of focus.
-_MIRRORED_STEPS = 8
 #: Flags of a fit whose search need not be done again for a model with diffraction.
 _BESIDE_THE_SEARCH = DonutFlag.AMBIGUOUS_SIDE | DonutFlag.OTHER_SIZE
-#: Loss of the other side beyond that of the given one, over what contradicts it, with which it is not what was given.
-_HOPELESS = 2.0
 #: Least fraction of the variance of the image that the model explains.
 _EXPLAINED = 0.5
-#: Loss a coarse pixel from which on what the model lacks may be a patch of the stamp that is no star, and something of
-#: another size is no donut.
-_POOR = 1.0
 #: Sizes over that of the telescope's donut between which something that fits badly may still be one.
 _LIKE_DONUTS = (0.7, 1.35)
 #: Largest part of the misfit that a search without patches may leave.
@@ -55,6 +46,12 @@ _MASKED = 0.4
 _DARK = 0.01
 #: Sizes of donuts over that of the telescope's own between which nothing is said of them: by 120 um of 1500 of defocus.
 _SIZES = (0.92, 1.08)
+#: Motion of the light by the wavefront over the size of the donut, both rms, from which on something is no donut: stars
+#: in focus have 0.8 to 1.1.
+_MOVED = 0.7
+#: The same of something that fits badly, and its loss a pixel: a donut half as large has 0.5.
+_MOVED_BADLY = 0.5
+_BADLY = 1.2
 #: Largest part of the light that rims which have run away make less than none: a star in focus, for which the fit moved
 #: the rim of M2 by 3 m, has 0.07.
 _NEGATIVE = 0.03
@@ -150,19 +147,19 @@ def fit_star(
         # On a stamp that is much smaller than its donut nothing stands out.
         return StarFit(DonutFlag.MOSTLY_LOST if donut and fitter.lost_at_best(start.stamp) > _LOST else flags)
     search = _search(fitter, start)
-    if donut and search.misfit > _POOR:
+    if donut and search.misfit > POOR:
         search = _masked_search(search.fitter, search)
-    if donut and search.misfit > _POOR and not _is_between(_size(search.start.stamp, search.best), _LIKE_DONUTS):
+    if donut and search.misfit > POOR and not _is_between(_size(search.start.stamp, search.best), _LIKE_DONUTS):
         return StarFit(DonutFlag.NO_DONUT | DonutFlag.OTHER_SIZE)
     if donut and is_hopeless(instrument.terms, search.best):
         lost = search.fitter.lost_light(search.start.stamp, search.best).any_pixel > _LOST
         return StarFit(DonutFlag.MOSTLY_LOST if lost else DonutFlag.UNDETERMINED)
-    sides, mirrored = None, None
+    sides, mirrored, other_side = None, None, OtherSide(search.fitter, search.start)
     if donut and wavefront:
-        sides, mirrored = _both_sides(search.fitter, search.start, search.best)
+        sides, mirrored = other_side.compared(search.best)
     explained = _explained(search.start.stamp, search.best)
     # Before rims are free, with which the wrong side of focus fits much.
-    if donut and explained and _other_focus_is_better(search.fitter, search.start, search.best, mirrored):
+    if donut and explained and other_side.is_better(search.best, mirrored):
         return StarFit(DonutFlag.DEFOCUS_SIGN, sides=sides)
     if fitter.searches_rims:
         search = _search_of_rims(fitter, search)
@@ -264,12 +261,15 @@ def _finished(
         return StarFit(DonutFlag.MOSTLY_LOST)
     if lost.regions > _CUT_OFF:
         flags |= DonutFlag.CUT_OFF
-    if not _is_between(_size(finest.stamp, finest.solution), _SIZES):
+    size = _size(finest.stamp, finest.solution)
+    if not _is_between(size, _SIZES):
         flags |= DonutFlag.OTHER_SIZE
     if sides is not None and sides.ambiguous:
         flags |= DonutFlag.AMBIGUOUS_SIDE
     if electron is not None and flags.usable:
         finest, unit = fitter.with_measured_noise(finest, electron)
+    if fitter.donut and (_is_no_donut(finest, size) or (flags & DonutFlag.CLIPPED and _is_clipped(fitter, finest))):
+        return StarFit(DonutFlag.NO_DONUT | (flags & DonutFlag.OTHER_SIZE))
     return StarFit(flags, finest, unit, sides=sides, preliminary=preliminary)
 
 
@@ -286,7 +286,7 @@ class _Search:
     @property
     def misfit(self) -> float:
         """Loss a coarse pixel, of which smoothed noise has next to nothing."""
-        return _misfit(self.start.stamp, self.best)
+        return misfit_of(self.start.stamp, self.best)
 
 
 def _search(fitter: StarFitter, start: Start) -> _Search:
@@ -295,7 +295,7 @@ def _search(fitter: StarFitter, start: Start) -> _Search:
     search = _Search(fitter, start, best, best)
     if not fitter.donut:
         return search
-    if search.misfit > _MISFIT:
+    if search.misfit > MISFIT:
         used = fitter.without_outliers(best.stars[0], best.waves[0], lines_only=True)
         if (used != fitter.clean.used).any():
             fitter = fitter.with_used(used)
@@ -314,7 +314,7 @@ def _search_of_rims(begun: StarFitter, search: _Search) -> _Search:
     like a cosmic ray, so that rims are searched for without those. Pixels of the fitter that has begun are used again
     where the model with these rims explains them.
     """
-    if search.misfit <= _MISFIT:
+    if search.misfit <= MISFIT:
         return search
     found, first = replace(search, best=search.single), search.start.unknowns
     begin: Solution | None = replace(search.single, stars=(first,), shared=np.zeros_like(search.single.shared))
@@ -325,7 +325,7 @@ def _search_of_rims(begun: StarFitter, search: _Search) -> _Search:
         found, begin = _with_explained_pixels(begun, another), None
     if not found.misfit < search.misfit:
         return search
-    if found.misfit > _MISFIT and begun.instrument.model.neighbours:
+    if found.misfit > MISFIT and begun.instrument.model.neighbours:
         return replace(found, best=_with_neighbours(found.fitter, found.start, found.best))
     return found
 
@@ -338,7 +338,7 @@ def _diffraction_explains(search: _Search) -> bool:
     light, rays = fitter.instrument.diffracted(fitter.light), start.rays
     assert isinstance(rays, ZernikeRays)
     stamp = fitter.instrument.stamp(light, search.start.pixels, rays, start.grid.sharp, start.grid.reach)
-    return _misfit(stamp, fitter.solve(stamp, best.stars[0], best.shared, COARSE)) <= _MISFIT
+    return misfit_of(stamp, fitter.solve(stamp, best.stars[0], best.shared, COARSE)) <= MISFIT
 
 
 def _with_another_rim(search: _Search, first: Solution | None) -> _Search:
@@ -346,7 +346,7 @@ def _with_another_rim(search: _Search, first: Solution | None) -> _Search:
     fitter, start = search.fitter, search.start
     fit = RimFit(fitter.light, start.stamp, search.best, search.rivals)
     explained = partial(_diffraction_explains, search)
-    found = with_another_rim(fitter.instrument, fit, _MISFIT, _coarse_solver(fitter, start), first, explained)
+    found = with_another_rim(fitter.instrument, fit, MISFIT, _coarse_solver(fitter, start), first, explained)
     return search if found is fit else _of_rims(fitter, start, found)
 
 
@@ -412,58 +412,6 @@ def _with_neighbours(fitter: StarFitter, start: Start, single: Solution) -> Solu
     return NeighbourSearch(room, fitter.solve, start.unknowns, start.template, diameter).from_single(single)
 
 
-def _both_sides(fitter: StarFitter, start: Start, solution: Solution) -> tuple[BothSides | None, Solution | None]:
-    """Return the fits on the side of focus that is given and on the other one, and this; None for blends.
-
-    About the axis a wavefront W of one side of focus and -W turned by 180 degrees of the other make one image: the
-    search starts there.
-    """
-    star = solution.stars[0]
-    if len(star) > RATIO:
-        return None, None
-    noll, count = fitter.instrument.noll, start.stamp.used.sum()
-    shared = np.zeros_like(solution.shared)
-    even = np.array([noll_to_nm(int(j))[0] % 2 == 0 for j in noll])
-    shared[: len(noll)] = np.where(even, -1.0, 1.0) * solution.shared[: len(noll)]
-    # Far from both sides alike, it does not matter how far, nor that some other cells of the pupil are lit.
-    hopeless = solution.loss + _HOPELESS * CONTRADICTED / _loss_scale(solution.loss / count)
-    stamp = fitter.mirrored_stamp(fitter.instrument.mirrored(fitter.light, exact=False), start)
-    mirrored = fitter.solve(stamp, star, shared, COARSE, _MIRRORED_STEPS, hopeless)
-    if mirrored.loss < hopeless:
-        stamp = fitter.stamp(fitter.instrument.mirrored(fitter.light), start.pixels)
-        mirrored = fitter.solve(stamp, mirrored.stars[0], mirrored.shared, COARSE, _MIRRORED_STEPS, hopeless)
-    # What no side explains is in units of what is left.
-    scale = _loss_scale(min(solution.loss, mirrored.loss) / count)
-    n = len(fitter.instrument.terms.requested)
-    believed_side, mirrored_side = (
-        SideFit(scale * side.loss, side.shared[:n], side.shared_covariance[:n, :n] / scale)
-        for side in (solution, mirrored)
-    )
-    return BothSides(believed_side, mirrored_side, fitter.light.depth), mirrored
-
-
-def _loss_scale(loss: float) -> float:
-    """Return the factor by which losses count where the better fit leaves a loss a pixel."""
-    return 1.0 / max(1.0, loss / _MISFIT)
-
-
-def _other_focus_is_better(fitter: StarFitter, start: Start, solution: Solution, mirrored: Solution | None) -> bool:
-    """Return whether the image fits a detector on the other side of focus better."""
-    misfit = _misfit(start.stamp, solution)
-    if misfit < _MISFIT:
-        return False
-    if mirrored is None or misfit > _POOR:
-        light = fitter.instrument.mirrored(fitter.light)
-        mirrored_start = fitter.start_on(start.pixels, fitter.stamp(light, start.pixels))
-        mirrored = fitter.solve(mirrored_start.stamp, mirrored_start.unknowns, tolerance=COARSE, hopeless=solution.loss)
-    return explains_more(mirrored, solution)
-
-
-def _misfit(stamp: Stamp, solution: Solution) -> float:
-    """Return the loss a pixel."""
-    return float(solution.loss) / max(int(stamp.used.sum()), 1)
-
-
 def _is_between(value: float, limits: tuple[float, float]) -> bool:
     return limits[0] < value < limits[1]
 
@@ -482,6 +430,34 @@ def _size(stamp: Stamp, solution: Solution) -> float:
         return float(np.sqrt(weights @ ((landing - weights @ landing) ** 2).sum(axis=1)))
 
     return radius(stamp.rays.landing(wave)) / max(radius(stamp.rays.landing(np.zeros_like(wave))), 1e-12)
+
+
+def _is_no_donut(star: StarSolution, size: float) -> bool:
+    """Return whether a fit of a relative size is of something else, of which it explains a part."""
+    motion, badly = _motion(star.stamp, star.solution), misfit_of(star.stamp, star.solution) > _BADLY
+    return motion > _MOVED or (badly and (motion > _MOVED_BADLY or not _is_between(size, _LIKE_DONUTS)))
+
+
+def _is_clipped(fitter: StarFitter, star: StarSolution) -> bool:
+    """Return whether all that stood out at the start was left out as no part of a donut, and noise is fitted."""
+    unknowns = star.solution.stars[0].copy()
+    unknowns[FLUX] = 0.0
+    light = star.model - model_image(star.full, unknowns, star.solution.waves[0])
+    squares = light**2 / pixel_variance(star.full, star.model)
+    significance = float(np.sqrt(squares[star.full.used].sum()))
+    return is_hidden(significance, len(fitter.instrument.terms.requested))
+
+
+def _motion(stamp: Stamp, solution: Solution) -> float:
+    """Return how far a wavefront moves the light of a donut, over its size without, both rms."""
+    wave = solution.waves[0]
+    weights, straight = stamp.rays.weights(wave), stamp.rays.landing(np.zeros_like(wave))
+
+    def mean_square(landing: np.ndarray) -> float:
+        return float(weights @ ((landing - weights @ landing) ** 2).sum(axis=1))
+
+    moved, size = mean_square(stamp.rays.landing(wave) - straight), mean_square(straight)
+    return float(np.sqrt(max(moved, 0.0) / max(size, 1e-24)))
 
 
 def _explained(stamp: Stamp, solution: Solution) -> bool:

@@ -19,11 +19,16 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.interpolate import PchipInterpolator
+from scipy.linalg import lapack
 from scipy.optimize import minimize
+
+from .residual_patterns import AIR_UNIT, RMS_LOGARITHMS
 
 #: Rms of the air's wavefront about which its prior lies, that of 15 s under median seeing, Z4 to Z22 [m].
 AIR_RMS = 110e-9
+#: Rms of the air at which residuals of images say how likely it is [m].
+RMS = AIR_UNIT * np.exp(RMS_LOGARITHMS)
 #: Largest air that can be told from wavefronts that have nothing in common [m].
 MOST_AIR = 3e-6
 #: Standard deviation of the logarithm of the air's variance, and of those of the telescope.
@@ -85,11 +90,23 @@ class ExposureAir:
         Part of it that all donuts of the exposure share.
     rms : float, optional
         Rms, Z4 to Z22 [m]; fitted by default.
+    losses : ndarray, shape [n_rms], optional
+        What residuals of the images say of this: twice the negative logarithm of the likelihood at :data:`RMS`.
     """
 
     shape: np.ndarray
     shared: float
     rms: float | None = None
+    losses: np.ndarray | None = None
+
+    def loss(self, logarithm: float) -> tuple[float, float]:
+        """Return what residuals say of the logarithm of an rms, and its slope; nothing below the least one."""
+        if self.losses is None:
+            return 0.0, 0.0
+        inside = float(np.clip(logarithm, *np.log(RMS[[0, -1]])))
+        curve = PchipInterpolator(np.log(RMS), self.losses)
+        slope = float(curve(inside, 1)) if logarithm >= inside else 0.0
+        return float(curve(inside)) + slope * (logarithm - inside), slope
 
 
 @dataclass(frozen=True)
@@ -115,12 +132,23 @@ class Basis:
         """Return variances of the terms by the sizes of the parts [m^2], shape [n_term]."""
         if self.variance is not None:
             return self.variance
+        return np.where(self.field_degree == 0, _UNIFORM_RMS**2, np.sum(self._varying(sizes)[:2], axis=0))
+
+    def slopes(self, sizes: Sizes) -> np.ndarray:
+        """Return the slopes of the variances by the third to fifth logarithm of :meth:`Sizes.of`, shape [3, n_term]."""
+        if self.variance is not None:
+            return np.zeros((3, len(self.variance)))
+        falling, bent, steps = self._varying(sizes)
+        slopes = np.array([2.0 * falling, -math.log(sizes.fall) * steps * falling, 2.0 * bent])
+        return np.where(self.field_degree == 0, 0.0, slopes)
+
+    def _varying(self, sizes: Sizes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return both parts of the variances of terms that vary over the field, and steps of the fall of the first."""
         assert self.field_degree is not None
         assert self.pupil_degree is not None
         beyond = self.field_degree - 1.0
         steps = beyond + (self.pupil_degree - self.pupil_degree.min())
-        varying = sizes.linear**2 * sizes.fall**-steps + sizes.bent**2 * _FALL**-beyond
-        return np.where(self.field_degree == 0, _UNIFORM_RMS**2, varying)
+        return sizes.linear**2 * sizes.fall**-steps, sizes.bent**2 * _FALL**-beyond, steps
 
 
 @dataclass(frozen=True)
@@ -216,12 +244,17 @@ def fit_hierarchy(observations: Observations, basis: Basis, air: ExposureAir) ->
         logarithms[index] = values
         return Sizes.of(logarithms)
 
-    def loss(values: np.ndarray) -> float:
-        prior = float((((values - middle[index]) / spread[index]) ** 2).sum())
-        return model.loss(sizes(values)) + prior
+    def loss(values: np.ndarray) -> tuple[float, np.ndarray]:
+        deviation = (values - middle[index]) / spread[index]
+        parts = sizes(values)
+        of_model, slopes = model.loss(parts)
+        of_residuals, slope = air.loss(math.log(parts.air))
+        slopes[1] += slope
+        total = of_model + of_residuals + float(deviation @ deviation)
+        return total, slopes[index] + 2.0 * deviation / spread[index]
 
     bounds = list(zip(least[index], most[index], strict=True))
-    best = minimize(loss, middle[index], method="L-BFGS-B", bounds=bounds, options={"eps": 1e-3, "maxiter": 40})
+    best = minimize(loss, middle[index], jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 40})
     return model.solved(sizes(best.x), float(best.fun))
 
 
@@ -304,31 +337,72 @@ class _Model:
             inverses.append(inverse)
         return curvature, gradient, loss, inverses
 
-    def loss(self, sizes: Sizes) -> float:
-        """Return twice the negative logarithm of the likelihood, the terms integrated over."""
-        curvature, gradient, loss, _ = self._normal(sizes)
-        scale = 1.0 / np.sqrt(np.diag(curvature))
-        try:
-            factor = cho_factor(curvature * np.outer(scale, scale), lower=True)
-        except np.linalg.LinAlgError:
-            return 1e30
-        scaled = scale * gradient
-        determinant = 2.0 * float(np.log(np.diag(factor[0])).sum() - np.log(scale).sum())
-        return loss + determinant - float(scaled @ cho_solve(factor, scaled))
+    def loss(self, sizes: Sizes) -> tuple[float, np.ndarray]:
+        """Return twice the negative logarithm of the likelihood, the terms integrated over, and its slopes, [6].
+
+        These are by the logarithms of :meth:`Sizes.of`.
+        """
+        curvature, gradient, loss, inverses = self._normal(sizes)
+        root = _root_of_inverse(curvature)
+        if root is None:
+            return 1e30, np.zeros(6)
+        terms = root.T @ (root @ gradient)
+        loss -= 2.0 * float(np.log(np.diag(root)).sum()) + float(gradient @ terms)
+        return loss, self._slopes(sizes, inverses, root, terms)
+
+    def _slopes(self, sizes: Sizes, inverses: list[np.ndarray], root: np.ndarray, terms: np.ndarray) -> np.ndarray:
+        r"""Return the slopes of :meth:`loss`, from a root of the covariance of the terms and these.
+
+        With the covariance V of wavefronts beside the terms u, of precision P, and K, Q and w of :meth:`_beside` they
+        are :math:`\mathrm{tr}\,Q\,dV - w^T dV w + \mathrm{tr}\,(K^{-1} - P^{-1})\,dP + u^T dP u`.
+        """
+        slopes = np.zeros(6)
+        above = 2.0 * (1.0 - self._shared) * (sizes.air / _UNIT) ** 2
+        for group, inverse in zip(self._groups, inverses, strict=True):
+            n_star, size = group.shape
+            precision, pull = self._beside(group, inverse, root, terms)
+            by_donuts = (precision - pull[:, :, None] * pull[:, None, :]).reshape(n_star, size, self._n, size, self._n)
+            for k in range(size):
+                of_donut = by_donuts[:, k, :, k]
+                slopes[0] += sizes.noise * float(np.vdot(of_donut, self._noise[group[:, k]]))
+                slopes[1] += above * float(np.vdot(of_donut.sum(axis=0), self._shape))
+            slopes[5] += 2.0 * float(np.vdot(by_donuts.sum(axis=(0, 1, 3)), self._local(sizes)))
+        variance = self._basis.variances(sizes)
+        first = len(variance)
+        squares = (root[:, :first] ** 2).sum(axis=0) + terms[:first] ** 2
+        slopes[2:5] = self._basis.slopes(sizes) @ ((1.0 - squares / variance) / variance)
+        of_ground = root[:, first:].T @ root[:, first:] + np.outer(terms[first:], terms[first:])
+        ground = self._precision(sizes)[0][first:, first:]
+        slopes[1] += 2.0 * (self._n_shared - float(np.vdot(of_ground, ground)))
+        return slopes
+
+    def _beside(
+        self, group: np.ndarray, inverse: np.ndarray, root: np.ndarray, terms: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        r"""Return what a group's wavefronts y say beside all terms, :math:`Q` [n_star, n, n], and w [n_star, n].
+
+        With the inverse of V, the columns D of terms u and their covariance :math:`K^{-1}`, of which there is a root,
+        :math:`Q = V^{-1} - V^{-1} D K^{-1} D^T V^{-1}` is a block of the inverse covariance of all wavefronts, and
+        :math:`w = V^{-1} (y - D u)` what that makes of these.
+        """
+        n_star, size = group.shape
+        design = self._design[group].reshape(n_star, size * self._n, -1)
+        weighted = inverse @ design
+        determined = (weighted.reshape(-1, weighted.shape[2]) @ root.T).reshape(weighted.shape)
+        residual = self._values[group].reshape(n_star, -1) - design @ terms
+        return inverse - determined @ np.swapaxes(determined, 1, 2), np.einsum("gab,gb->ga", inverse, residual)
 
     def chi2_by_the_others(self, sizes: Sizes) -> np.ndarray:
         """Return chi-square a term of each donut's star about what other stars say of it, shape [n]."""
         curvature, gradient, _, inverses = self._normal(sizes)
-        scale, result = 1.0 / np.sqrt(np.diag(curvature)), np.zeros(self._count)
+        root, result = _root_of_inverse(curvature), np.zeros(self._count)
+        if root is None:
+            return result
         for group, inverse in zip(self._groups, inverses, strict=True):
-            for donuts, precision in zip(group, inverse, strict=True):
-                design = self._design[donuts].reshape(-1, len(scale)) * scale
-                values, weighted = self._values[donuts].ravel(), precision @ design
-                of_others = curvature * np.outer(scale, scale) - design.T @ weighted
-                covariance = np.linalg.pinv(of_others, hermitian=True)
-                residual = values - design @ covariance @ (scale * gradient - weighted.T @ values)
-                expected = np.linalg.inv(precision) + design @ covariance @ design.T
-                result[donuts] = residual @ np.linalg.solve(expected, residual) / len(values)
+            precision, pull = self._beside(group, inverse, root, root.T @ (root @ gradient))
+            # Blocks of the inverse covariance of all are those of each about all others.
+            chi2 = np.einsum("ga,ga->g", pull, np.linalg.solve(precision, pull[..., None])[..., 0])
+            result[group] = chi2[:, None] / pull.shape[1]
         return result
 
     def solved(self, sizes: Sizes, loss: float) -> Hierarchy:
@@ -379,6 +453,14 @@ class _Model:
             total * _UNIT,
             total_covariance * _UNIT**2,
         )
+
+
+def _root_of_inverse(matrix: np.ndarray) -> np.ndarray | None:
+    """Return a triangular root whose transpose times itself is the inverse of a positive matrix; None if it is not."""
+    scale = 1.0 / np.sqrt(np.diag(matrix))
+    # Of a symmetric matrix the transpose is in the order of LAPACK, without a copy.
+    factor, failed = lapack.dpotrf((matrix * np.outer(scale, scale)).T, lower=1, clean=1, overwrite_a=1)
+    return None if failed else np.asarray(lapack.dtrtri(factor, lower=1, overwrite_c=1)[0] * scale)
 
 
 def star_numbers(fields: np.ndarray, within: float, names: Sequence[int] | None = None) -> np.ndarray:

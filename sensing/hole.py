@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
@@ -55,9 +56,7 @@ def warn_of_other_hole(instrument: Instrument, solutions: dict[int, StarSolution
     """Warn where donuts have another obscuration than the light of the telescope, all around."""
     telescope = instrument.telescope
     donut, model = _brightest_ratios(instrument, solutions, fit)
-    # An image of the telescope that has no hole tells no scale.
-    scaled = model > 0.0
-    relative = np.where(scaled, donut / np.where(scaled, model, 1.0) - 1.0, np.nan)
+    relative = _relative(donut, model)
     # Obscurations are below 1, and differ by no more than these do.
     alike = np.abs(relative) <= _DIFFERENCE
     mixed = np.nanmin(relative, initial=0.0) < 0.0 < np.nanmax(relative, initial=0.0)
@@ -68,7 +67,7 @@ def warn_of_other_hole(instrument: Instrument, solutions: dict[int, StarSolution
     lit = lit_obscuration(telescope, instrument.middle)
     if max(donut.max(), model.max()) < _FILLED * lit:
         return
-    shown = np.where(scaled, lit * (1.0 + relative), donut)
+    shown = np.where(model > 0.0, lit * (1.0 + relative), donut)
     differences = shown - lit
     if (np.abs(differences) > _DIFFERENCE).all() and np.ptp(np.sign(differences)) == 0.0:
         text = (
@@ -84,13 +83,28 @@ def _brightest_ratios(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return inner over outer radii of the brightest donuts and of the telescope's images, quadrants, each [n, 4].
 
-    Donuts without clear edges are left out.
+    Donuts without clear edges are left out, and all after one whose hole is in some quadrant as believed: it decides.
     """
     clear = [i for i in solutions if not DonutFlag(int(fit.flags[i])) & _UNFIT]
     brightest = sorted(clear, key=lambda i: -fit.flux[i])[:_DONUTS]
-    ratios = np.array([_ratios(instrument, solutions[i], fit, i) for i in brightest]).reshape(-1, 2, _QUADRANTS)
-    donut, model = np.moveaxis(ratios[np.isfinite(ratios).all(axis=(1, 2))], 1, 0)
+    ratios: list[np.ndarray] = []
+    for i in brightest:
+        of_donut = np.array(_ratios(instrument, solutions[i], fit, i))
+        if np.isfinite(of_donut).all():
+            ratios.append(of_donut)
+            if (np.abs(_relative(*of_donut)) <= _DIFFERENCE).any():
+                break
+    donut, model = np.moveaxis(np.array(ratios).reshape(-1, 2, _QUADRANTS), 1, 0)
     return donut, model
+
+
+def _relative(donut: np.ndarray, model: np.ndarray) -> np.ndarray:
+    """Return how much larger holes of donuts are than those of the telescope's images; NaN where these tell no scale.
+
+    Such an image has no hole.
+    """
+    scaled = model > 0.0
+    return np.where(scaled, donut / np.where(scaled, model, 1.0) - 1.0, np.nan)
 
 
 def lit_obscuration(telescope: Telescope, wavelength: float) -> float:
@@ -133,7 +147,7 @@ def _edges_of_quadrants(image: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Return inner and outer edges [pixels] of the quadrants about the middle of the light, and levels, [3, 4]."""
     y, x = (np.arange(n) - 0.5 * (n - 1) for n in image.shape)
     smooth = gaussian_filter(np.where(used, image, 0.0), _SMOOTH)
-    lit = smooth[smooth > 0.0]
+    lit = np.sort(smooth[smooth > 0.0])
     bright = smooth > 0.5 * _level(lit, lit)
     row, column = np.nonzero(bright)
     center = np.array([x[column].mean(), y[row].mean()]) if len(row) else np.zeros(2)
@@ -148,12 +162,18 @@ def _edge_shift(blur: float, unit: float) -> float:
     In the unit of `blur`, the rms of a Gaussian, and `unit`, the length sqrt(wavelength * distance / 2) of Fresnel's
     integrals (Born & Wolf, Principles of Optics, 8.7).
     """
-    v = np.linspace(-_FAR, _FAR, _POINTS)
-    sine, cosine = fresnel(v)
-    light = 0.5 * ((cosine + 0.5) ** 2 + (sine + 0.5) ** 2)
+    v, light = _straight_edge()
     if blur > 0.0:
         light = gaussian_filter1d(light, blur / unit / (v[1] - v[0]))
     return float(v[np.argmax(light > 0.5)] * unit)
+
+
+@lru_cache(maxsize=1)
+def _straight_edge() -> tuple[np.ndarray, np.ndarray]:
+    """Return the light that a straight edge diffracts, by the distance from it in Fresnel's unit."""
+    v = np.linspace(-_FAR, _FAR, _POINTS)
+    sine, cosine = fresnel(v)
+    return v, 0.5 * ((cosine + 0.5) ** 2 + (sine + 0.5) ** 2)
 
 
 def _image(places: np.ndarray, weights: np.ndarray, size: int, fwhm: float) -> np.ndarray:

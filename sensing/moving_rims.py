@@ -19,7 +19,7 @@ from ..models.telescope import Telescope
 from ..raytrace.rays import RayStatus, parallel_rays
 from ..raytrace.trace import TraceResult, trace
 from ..wavefront.pupil_polynomials import PupilPolynomials
-from .pupil_cells import FEWEST, PupilCells, near_smooth_map, pupil_cells
+from .pupil_cells import FEWEST, PupilCells, PupilSurvey, pupil_cells
 from .rim_outlines import MOTIONS, RimMotion, Simple, is_vane, moved_aperture, outline, simple_regions, vane_width
 
 #: Standard deviation of the shift and of the growth of a rim over its own size, and most of it over the diameter of the
@@ -251,10 +251,10 @@ class PupilShadows:
         along = half * np.linspace(-1.0, 1.0, _SURVEY)
         middle = 0.5 * (cells.points.min(axis=0) + cells.points.max(axis=0))
         lattice = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
-        self._survey = middle + lattice[np.hypot(*lattice.T) <= 1.1 * half]
+        survey = middle + lattice[np.hypot(*lattice.T) <= 1.1 * half]
         self._middle, self._half = middle, half
-        self._ends = self._traced(self._survey)
-        self._polynomials: dict[bytes, PupilPolynomials] = {}
+        self._ends = self._traced(survey)
+        self._survey = PupilSurvey(survey, self._ends[-1].status == RayStatus.OK, middle, half)
 
     def _traced(self, points: np.ndarray) -> list[TraceResult]:
         """Return rays through points of the pupil [n, 2] at all surfaces."""
@@ -290,14 +290,11 @@ class PupilShadows:
         None where too little of the light meets it.
         """
         places = self._places(surface, self._ends)
-        lit = self._ends[-1].status == RayStatus.OK
-        reached = near_smooth_map(self._survey, places, lit, self._middle, self._half)
+        reached = self._survey.near_smooth_map(places)
         if reached.sum() < FEWEST:
             return None
-        key = reached.tobytes()
-        if key not in self._polynomials:
-            self._polynomials[key] = PupilPolynomials(self._survey[reached], self._middle, self._half)
-        return self._polynomials[key], self._polynomials[key].fitted(places[reached]), places[reached]
+        polynomials = self._survey.smooth(reached)
+        return polynomials, polynomials.fitted(places[reached]), places[reached]
 
     def _shadows(self, surface: int, numbers: dict[int, int]) -> tuple[np.ndarray, ...]:
         """Return the outlines of some regions of a surface on the pupil, lit or not; each region has a number.

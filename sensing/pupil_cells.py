@@ -213,13 +213,13 @@ def _crossed(
     survey = np.stack(np.meshgrid(*along.T), axis=-1).reshape(-1, 2)
     ends = trace(telescope, parallel_rays(telescope, direction[None], wavelength, survey), "all", threads=1)
     crossed, narrowest = np.zeros(len(places), dtype=bool), math.inf
+    pupil = PupilSurvey(survey, ends[-1].status == RayStatus.OK, 0.5 * (places[0] + places[-1]), side)
     for surface, regions in vanes.items():
         landing = telescope.surfaces[surface].to_local(ends[surface].position)[:, :2]
-        middle = 0.5 * (places[0] + places[-1])
-        met = near_smooth_map(survey, landing, ends[-1].status == RayStatus.OK, middle, side)
+        met = pupil.near_smooth_map(landing)
         if not met.any():
             continue
-        smooth = PupilPolynomials(survey[met], middle, side)
+        smooth = pupil.smooth(met)
         x, y = smooth.at(places, landing[met])[0].T
         largest = float(np.linalg.svd(smooth.derivatives(landing[met]), compute_uv=False).max())
         for region in regions:
@@ -228,23 +228,44 @@ def _crossed(
     return crossed.reshape(centers.shape[:-1]), narrowest
 
 
-def near_smooth_map(
-    points: np.ndarray, places: np.ndarray, lit: np.ndarray, center: np.ndarray, least: float
-) -> np.ndarray:
-    """Return which rays meet a surface where a smooth map of the lit ones has them, or nearly, [n].
+class PupilSurvey:
+    """Places on surfaces of rays through points of the pupil, as smooth functions of these.
 
-    Rays that were stopped may pass later lenses far outside of what is ground. Arguments: points of the pupil [n, 2],
-    places on the surface [n, 2], NaN where they miss it, which rays are lit, and `center` and `least` of
-    :class:`~pachon.wavefront.pupil_polynomials.PupilPolynomials`. All that meet it where few are lit.
+    Parameters
+    ----------
+    points : ndarray, shape [n, 2]
+        Points of the plane of the entrance pupil [m].
+    lit : ndarray of bool, shape [n]
+        Which of their rays pass all apertures.
+    center, least
+        Those of :class:`~pachon.wavefront.pupil_polynomials.PupilPolynomials`.
     """
-    met = np.isfinite(places).all(axis=1)
-    lit = lit & met
-    if (met.all() and lit.all()) or lit.sum() < FEWEST:
+
+    def __init__(self, points: np.ndarray, lit: np.ndarray, center: np.ndarray, least: float) -> None:
+        self.points, self._lit = points, lit
+        self._center, self._least = center, least
+        self._polynomials: dict[bytes, PupilPolynomials] = {}
+
+    def smooth(self, rays: np.ndarray) -> PupilPolynomials:
+        """Return polynomials through values at the points of some rays, which are the same for many surfaces."""
+        key = rays.tobytes()
+        if key not in self._polynomials:
+            self._polynomials[key] = PupilPolynomials(self.points[rays], self._center, self._least)
+        return self._polynomials[key]
+
+    def near_smooth_map(self, places: np.ndarray) -> np.ndarray:
+        """Return which rays meet a surface where a smooth map of the lit ones has them, or nearly, [n].
+
+        Rays that were stopped may pass later lenses far outside of what is ground. Places on the surface [n, 2] are NaN
+        where rays miss it. All that meet it where few are lit.
+        """
+        met = np.isfinite(places).all(axis=1)
+        lit = self._lit & met
+        if (met.all() and lit.all()) or lit.sum() < FEWEST:
+            return met
+        expected = self.smooth(lit).at(self.points[met], places[lit])[0]
+        met[met] = np.hypot(*(places[met] - expected).T) < _ASTRAY * float(np.ptp(places[lit], axis=0).max())
         return met
-    smooth = PupilPolynomials(points[lit], center, least)
-    expected = smooth.at(points[met], places[lit])[0]
-    met[met] = np.hypot(*(places[met] - expected).T) < _ASTRAY * float(np.ptp(places[lit], axis=0).max())
-    return met
 
 
 def _beam(telescope: Telescope, direction: np.ndarray, wavelength: float) -> tuple[np.ndarray, float]:

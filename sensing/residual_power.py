@@ -16,9 +16,7 @@ of the noise alone.
 
 A field of few patterns B with a covariance :math:`\theta B B^T`, light that moves as under terms of the wavefront which
 air has, shows in them alone. The strengths of the other fields are then those of residuals without these patterns, and
-:math:`\theta` is the likeliest one by the amplitudes of the patterns, in combinations that are independent: these have
-the variance of the noise and of the other fields, and :math:`\theta w`. Air has most in the few of large w. What has
-as much in all of them, a rim elsewhere for example, is taken for noise of a larger variance, in the unknowns too.
+:math:`\theta` is that of :mod:`.residual_patterns`.
 """
 
 from __future__ import annotations
@@ -31,10 +29,11 @@ from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
-from scipy.linalg import cho_factor, eigh, solve_triangular, toeplitz
+from scipy.linalg import cho_factor, solve_triangular, toeplitz
 from scipy.optimize import nnls
 
 from .likelihood import Linearized
+from .residual_patterns import Patterns
 
 #: Correlation lengths of noise [pixels of the fit].
 _NOISE_LENGTHS = (0.5, 0.8, 1.25, 2.0)
@@ -45,15 +44,6 @@ _LIGHT_LENGTH = 0.35
 _SIGNIFICANT = 3.0
 #: The same that a further field must explain.
 _NEEDED = 3.0
-#: Loss of the logarithm of the likelihood by each size that is fitted.
-_WORTH = 2.0
-#: Logarithms of the rms of a field of patterns between which the likeliest is searched, in units of itself.
-_RMS_LIMITS = (-5.0, 4.0)
-#: Values of each size that are tried at once, and times that this is done, each between the best one's neighbours.
-_STARTS = 9
-_ZOOMS = 5
-#: Variance of a combination of patterns over the largest one below which it says nothing.
-_FAINTEST = 1e-6
 #: Fields whose power in the residuals decides whether there is any beyond that of noise.
 _SCREENED = ("white", "noise_0.8", "brightness", "rims")
 #: Largest number of pixels; beyond, squares of them are summed.
@@ -76,11 +66,14 @@ class ResidualPower:
         Power of what the model lacks, in combinations of the unknowns that are independent of unit variance.
     strength : float
         Strength of the field of patterns, of which the power has nothing.
+    losses : ndarray, shape [n_rms], optional
+        Losses of the residuals by the rms of that field, at :data:`~pachon.sensing.residual_patterns.RMS_LOGARITHMS`.
     """
 
     root: np.ndarray
     power: np.ndarray
     strength: float = 0.0
+    losses: np.ndarray | None = None
 
     @property
     def covariance(self) -> np.ndarray:
@@ -138,103 +131,20 @@ def residual_power(
     pulls = squares.of(linearized.pulls[:, None].astype(np.float32))[:, 0]
     if prior_gradient is not None:
         pulls = pulls - columns @ (columns.T @ pulls - root.T @ prior_gradient).astype(np.float32)
-    beside = None if patterns is None else _Patterns.of(squares.of(patterns), columns, pulls)
+    beside = None if patterns is None else Patterns.of(squares.of(patterns), columns, pulls)
     if beside is not None:
         pulls, columns = pulls - beside.columns @ beside.amplitudes, np.hstack([columns, beside.columns])
-    n, strength = len(root), 0.0
+    n = len(root)
     residuals = _Residuals(squares.used, pulls, columns, _fields(linearized, squares, resolution))
     if max(residuals.excess(name) for name in _SCREENED) < _SIGNIFICANT:
         inner, of_patterns = np.zeros((n, n)), np.zeros((columns.shape[1] - n,) * 2)
     else:
         inner, of_patterns = residuals.power(n)
-    if beside is not None:
-        known = np.zeros_like(of_patterns) if expected is None else beside.power_of(squares.of(expected))
-        strength, level = beside.sizes(of_patterns + known)
-        inner = inner + level * (np.eye(n) + inner)
-    return ResidualPower(root, inner, strength)
-
-
-@dataclass(frozen=True)
-class _Patterns:
-    """Patterns of residuals that no unknown makes, in independent combinations.
-
-    Attributes
-    ----------
-    columns : ndarray, shape [n_pixel, m]
-        The combinations.
-    amplitudes : ndarray, shape [m]
-        Their amplitudes in the residuals, of unit variance by noise.
-    variances : ndarray, shape [m]
-        Further variances of these by a field of unit strength.
-    """
-
-    columns: np.ndarray
-    amplitudes: np.ndarray
-    variances: np.ndarray
-
-    @classmethod
-    def of(cls, patterns: np.ndarray, columns: np.ndarray, pulls: np.ndarray) -> _Patterns:
-        """Return what patterns [n_pixel, m] have beside the columns of the unknowns, and their amplitudes in pulls."""
-        beside = patterns - columns @ (columns.T @ patterns)
-        variances, vectors = np.linalg.eigh((patterns.T @ beside).astype(np.float64))
-        shown = variances > _FAINTEST * variances[-1]
-        vectors = vectors[:, shown] / np.sqrt(variances[shown])
-        amplitudes = vectors.T @ (patterns.T @ pulls)
-        return cls(beside @ vectors.astype(np.float32), amplitudes, variances[shown])
-
-    def power_of(self, patterns: np.ndarray) -> np.ndarray:
-        """Return the covariance of the amplitudes by a field of patterns [n_pixel, k], shape [m, m]."""
-        amplitudes = self.columns.T @ patterns
-        return np.asarray(amplitudes @ amplitudes.T, dtype=np.float64)
-
-    def sizes(self, power: np.ndarray) -> tuple[float, float]:
-        """Return the strength of the field, and the surplus of the variance in all combinations alike.
-
-        They are means over nothing, either of the two and both, each with the weight of its likelihood. Other fields
-        have a power [m, m] in the amplitudes.
-        """
-        count = len(self.variances)
-        if not count:
-            return 0.0, 0.0
-        variances, vectors = eigh(np.diag(self.variances), np.eye(count) + power)
-        energies = (vectors.T @ self.amplitudes) ** 2
-        # Amplitudes of the field from next to nothing to far beyond their own size, and the level of all up to the
-        # logarithm of their mean square, beyond it where the field lowers it.
-        noise = math.log(max(float(energies.mean()), 1.0))
-        fits = [(_loss_of_sizes(np.zeros(1), np.ones(1), energies, variances)[0], 0.0, 0.0)]
-        nothing = np.full(1, _RMS_LIMITS[0])
-        for rms_limits, most in ((_RMS_LIMITS, 0.0), (None, noise), (_RMS_LIMITS, noise + 1.0)):
-            rms = nothing if rms_limits is None else np.linspace(*rms_limits, _STARTS)
-            levels = np.linspace(0.0, most, _STARTS) if most else np.zeros(1)
-            for _ in range(_ZOOMS):
-                field, all_alike = np.broadcast_arrays(np.exp(2.0 * rms)[:, None], np.exp(levels))
-                losses = _loss_of_sizes(field.ravel(), all_alike.ravel(), energies, variances)
-                row, column = divmod(int(np.argmin(losses)), len(levels))
-                best = float(losses.min()), float(rms[row]), float(levels[column])
-                rms, levels = _nearer(rms, row), _nearer(levels, column)
-            strength, level = math.exp(2.0 * best[1]), 0.0
-            if most:
-                # What lies far out is part of it.
-                level = max(float((energies - strength * variances).mean()) - 1.0, 0.0)
-            worth = _WORTH * (int(rms_limits is not None) + int(most > 0.0))
-            fits.append((best[0] + worth, strength, level))
-        losses, strengths, levels = np.array(fits).T
-        weights = np.exp(losses.min() - losses)
-        weights /= weights.sum()
-        return float(weights @ strengths), float(weights @ levels)
-
-
-def _loss_of_sizes(strength: np.ndarray, level: np.ndarray, energies: np.ndarray, variances: np.ndarray) -> np.ndarray:
-    """Return the loss of normal amplitudes of given energies [m] by strengths of the field and levels of all, [n]."""
-    total = level[:, None] + strength[:, None] * variances
-    return np.asarray(0.5 * (np.log(total) + energies / total).sum(axis=1))
-
-
-def _nearer(values: np.ndarray, best: int) -> np.ndarray:
-    """Return as many values between those beside the best of evenly spaced ones; a single one as it is."""
-    if len(values) == 1:
-        return values
-    return np.linspace(values[max(best - 1, 0)], values[min(best + 1, len(values) - 1)], len(values))
+    if beside is None:
+        return ResidualPower(root, inner)
+    of_telescope = np.zeros_like(of_patterns) if expected is None else beside.power_of(squares.of(expected))
+    sizes = beside.sizes(of_patterns, of_telescope)
+    return ResidualPower(root, inner + sizes.level * (np.eye(n) + inner), sizes.strength, sizes.losses)
 
 
 class _Squares:

@@ -88,13 +88,13 @@ class DonutFit(Result):
     noll : ndarray of int, shape [n_noll]
         Noll indices.
     flux, flux_error : ndarray, shape [n]
-        Light of the star [electrons].
+        Light of the star [electrons, or the unit of images whose noise was not given].
     center, center_error : ndarray, shape [n, 2]
         Place (x, y) of the chief ray from the centre of the stamp [pixels].
     background : ndarray, shape [n]
-        Background at the centre of the stamp [electrons a pixel].
+        Background at the centre of the stamp [the same a pixel].
     background_slope : ndarray, shape [n, 2]
-        Slopes of the background along x and y [electrons a pixel, per pixel].
+        Slopes of the background along x and y [the same a pixel, per pixel].
     response_slope, response_slope_error : ndarray, shape [n, 2]
         Slopes of the detector's response along x and y, relative, a pixel; NaN where they are not fitted.
     fwhm, fwhm_error : ndarray, shape [n]
@@ -252,6 +252,11 @@ class DonutFit(Result):
         """
         return observatory_zernikes(self, convention, frame, frames or DonutFrames(), design, wave)
 
+    @property
+    def in_electrons(self) -> bool:
+        """Whether light is in electrons, as where the noise of the sky was given; else in the unit of the images."""
+        return bool((self.photon_variance[np.isfinite(self.photon_variance)] == 1.0).all())
+
     def _error_sizes(self) -> dict[str, np.ndarray]:
         """Return the root of the summed variances of the Zernikes by cause [m], shape [n]."""
         names = ("photons", "residuals", "air", "floor", "repeats")
@@ -267,12 +272,15 @@ class DonutFit(Result):
         table = QTable()
         table["field_x"], table["field_y"] = np.rad2deg(self.fields).T * u.deg
         table["flags"], table["reasons"] = self.flags, [reasons or "ok" for reasons in self.reasons]
-        table["flux"], table["flux_err"] = self.flux * u.electron, self.flux_error * u.electron
+        light, unit = (
+            (u.electron, "") if self.in_electrons else (u.dimensionless_unscaled, ", in the unit of the images")
+        )
+        table["flux"], table["flux_err"] = self.flux * light, self.flux_error * light
         for axis, name in enumerate("xy"):
             table[name], table[f"{name}_err"] = self.center[:, axis] * u.pix, self.center_error[:, axis] * u.pix
-        table["background"] = self.background * u.electron / u.pix
+        table["background"] = self.background * light / u.pix
         for axis, name in enumerate("xy"):
-            table[f"background_slope_{name}"] = self.background_slope[:, axis] * u.electron / u.pix**2
+            table[f"background_slope_{name}"] = self.background_slope[:, axis] * light / u.pix**2
         table["fwhm"], table["fwhm_err"] = arcseconds(self.fwhm) * u.arcsec, arcseconds(self.fwhm_error) * u.arcsec
         table["chi2"], table["n_pixels"] = self.chi2, self.n_pixels
         table["n_companions"] = np.isfinite(self.companions[:, :, 0]).sum(axis=1)
@@ -285,6 +293,8 @@ class DonutFit(Result):
             table[name].info.description = _MEANINGS.get(name.removesuffix("_err"), _WAVEFRONT)
             if name.endswith("_err"):
                 table[name].info.description = f"standard error of {name.removesuffix('_err')}"
+            elif name.startswith(("flux", "background")):
+                table[name].info.description += unit
         table.meta.update(
             telescope=self.telescope,
             wavelength_nm=(self.wavelengths * 1e9).tolist(),
@@ -296,6 +306,7 @@ class DonutFit(Result):
 
     def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit, of plain numbers and lists; None in place of NaN."""
+        light = "electrons" if self.in_electrons else "image_units"
         out: dict[str, Any] = {
             "telescope": self.telescope,
             "wavelength_nm": self.wavelengths * 1e9,
@@ -308,13 +319,13 @@ class DonutFit(Result):
             "zernike_nm": self.zernikes * 1e9,
             "zernike_error_nm": self.errors * 1e9,
             "error_parts_nm": {name: 1e9 * size for name, size in self._error_sizes().items()},
-            "flux_electrons": self.flux,
+            f"flux_{light}": self.flux,
             "center_pixels": self.center,
-            "background_electrons": self.background,
+            f"background_{light}": self.background,
             "fwhm_arcsec": arcseconds(self.fwhm),
             "chi2": self.chi2,
             "n_pixels": self.n_pixels,
-            "background_slope_electrons": self.background_slope,
+            f"background_slope_{light}": self.background_slope,
             "response_slope": self.response_slope,
             "companions": self.companions,
             "moved_rims": [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,15 +17,16 @@ from .hierarchy import ExposureAir
 from .image_model import STRENGTH
 from .light import Instrument
 from .likelihood import Linearized, linearized, wavefront_columns
+from .residual_patterns import AIR_UNIT
 from .residual_power import residual_power
 from .star_fitter import StarSolution
 
 #: Terms up to the eleventh radial degree: what the mean wavefront of the air has beyond is lost in the seeing.
 _AIR_TERMS = 78
-#: Rms of the wavefront of the air of unit strength, Z4 to Z22 together [m].
-_UNIT = 1e-7
 #: Variance of Kolmogorov's wavefront from Z4 on where the diameter of the pupil is Fried's parameter [rad^2].
 _NOLL_FROM_4 = 0.134
+#: Part of what residuals say of the air that counts: in few winds it has other shares of high orders than in all.
+_TRUST = 0.5
 #: Least variance of a term of the air over that of all from Z4 to Z22.
 _LEAST = 1e-9
 #: Full width at half maximum of a Gaussian over its rms.
@@ -93,12 +95,16 @@ class StarErrors:
     figure : ndarray, shape [n_noll, n_noll]
         What stars have in common: the telescope's terms beside those asked for, fitted with a prior or not, and the
         accuracy of the model.
+    air_losses : ndarray, shape [n_rms], optional
+        What the residuals say of the air: twice the negative logarithm of the likelihood of its rms, at
+        :data:`~pachon.sensing.residual_patterns.RMS_LOGARITHMS` in units of 100 nm.
     """
 
     covariance: np.ndarray
     parts: ErrorParts
     of_light: np.ndarray
     figure: np.ndarray
+    air_losses: np.ndarray | None = None
 
 
 def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
@@ -110,6 +116,7 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     wavefront = slice(n_star, n_star + n)
     photons, air = solution.covariance, terms.air
     figure, by_prior, speckled = np.zeros((3, n, n))
+    air_losses = None
     residuals, lacking = np.zeros_like(photons), solution.star_covariance(0).copy()
     point = linearized(star.stamp, solution.stars[0], solution.waves[0])
     if point is not None and len(solution.shared):
@@ -123,7 +130,7 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
             beside.unfitted,
             precision * deviation,
         )
-        residuals = power.covariance
+        residuals, air_losses = power.covariance, power.losses
         lacking += residuals[:n_star, :n_star]
         figure = beside.figure(photons)[wavefront, wavefront]
         # What a prior about zero takes from the telescope's further terms goes into those asked for.
@@ -144,7 +151,7 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
         of_noise = of_noise + star.steps.covariance[wavefront, wavefront]
     parts = ErrorParts.of(of_noise, of_residuals, air, figure + accuracy)
     of_light = parts.photons - by_prior + parts.residuals + speckled
-    return StarErrors(lacking, parts, of_light, figure + by_prior + accuracy)
+    return StarErrors(lacking, parts, of_light, figure + by_prior + accuracy, air_losses)
 
 
 def by_rivals(star: StarSolution, n: int) -> np.ndarray:
@@ -165,7 +172,7 @@ def _most_air(instrument: Instrument, seeing: float) -> float:
     """
     turbulence = instrument.telescope.pupil_diameter * seeing
     radians = _NOLL_FROM_4 * turbulence ** (5.0 / 3.0)
-    return radians * (REFERENCE_WAVELENGTH / (2.0 * math.pi * _UNIT)) ** 2 if seeing > 0.0 else math.inf
+    return radians * (REFERENCE_WAVELENGTH / (2.0 * math.pi * AIR_UNIT)) ** 2 if seeing > 0.0 else math.inf
 
 
 def with_errors(instrument: Instrument, star: StarSolution) -> StarSolution:
@@ -193,9 +200,24 @@ def air_of_zernikes(instrument: Instrument) -> np.ndarray:
     return air_of(instrument, max(_AIR_TERMS, int(instrument.terms.requested.max())))[np.ix_(low, low)]
 
 
-def exposure_air(instrument: Instrument, rms: float | None = None) -> ExposureAir:
-    """Return the mean wavefront of an exposure, of an rms of Z4 to Z22 [m] if it is known."""
-    return ExposureAir(air_of_zernikes(instrument), instrument.shared_air, rms)
+def exposure_air(instrument: Instrument, rms: float | None = None, losses: np.ndarray | None = None) -> ExposureAir:
+    """Return the mean wavefront of an exposure, of an rms of Z4 to Z22 [m] if it is known, with what residuals say."""
+    return ExposureAir(air_of_zernikes(instrument), instrument.shared_air, rms, losses)
+
+
+def air_losses(instrument: Instrument, stars: Sequence[StarSolution]) -> np.ndarray | None:
+    """Return what the residuals of the stars of an exposure say of its air, as :class:`ExposureAir` has it.
+
+    Stars have part of the air in common, and so say less than as many of their own would. An earlier fit says it where
+    the air's higher terms are fitted, which are then no residuals. None where none says anything.
+    """
+    if instrument.terms.air_losses is not None:
+        return instrument.terms.air_losses
+    of_stars = [star_errors(instrument, star).air_losses for star in stars]
+    losses = [values for values in of_stars if values is not None]
+    # Squares of two amplitudes are correlated as the square of the correlation of these.
+    alike = 1.0 + (len(losses) - 1) * instrument.shared_air**2
+    return _TRUST / alike * np.sum(losses, axis=0) if losses else None
 
 
 def air_of(instrument: Instrument, last: int) -> np.ndarray:
@@ -222,7 +244,7 @@ class _TermsBeside:
     def _shape(self) -> np.ndarray:
         """Covariance of Z4 to the last term by air of unit size [m^2]."""
         last = max(_AIR_TERMS, int(self._instrument.terms.every.max()))
-        return _UNIT**2 * air_of(self._instrument, last)
+        return AIR_UNIT**2 * air_of(self._instrument, last)
 
     @cached_property
     def _high(self) -> np.ndarray:
@@ -232,7 +254,7 @@ class _TermsBeside:
     @cached_property
     def _root(self) -> np.ndarray:
         """Root of the covariance of the terms beside those asked for [m], [m, m]."""
-        least = np.diag(np.full(len(self._high), _LEAST * _UNIT**2))
+        least = np.diag(np.full(len(self._high), _LEAST * AIR_UNIT**2))
         return np.linalg.cholesky(self._shape[np.ix_(self._high, self._high)] + least)
 
     @cached_property

@@ -43,6 +43,8 @@ class WavefrontTerms:
         Covariance of the terms asked for in the mean wavefront of the air [m^2].
     higher_order : float
         Rms of each term of the next radial degree [m].
+    air_losses : ndarray, optional
+        What residuals said of the air before its higher terms were fitted; see :mod:`.star_errors`.
     """
 
     requested: np.ndarray
@@ -51,6 +53,7 @@ class WavefrontTerms:
     figure: np.ndarray
     air: np.ndarray
     higher_order: float = 0.0
+    air_losses: np.ndarray | None = None
 
     @classmethod
     def of(

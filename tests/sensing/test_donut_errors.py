@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from astropy import units as u
 from donut_images import PIXEL, WAVELENGTH, donut
 from scipy.ndimage import gaussian_filter
 
@@ -16,6 +17,7 @@ from pachon.sensing.air_shape import air_shape
 from pachon.sensing.cross_check import cross_checked
 from pachon.sensing.likelihood import Linearized
 from pachon.sensing.noise import measured_noise
+from pachon.sensing.residual_patterns import RMS_LOGARITHMS, Patterns
 from pachon.sensing.residual_power import residual_power
 from pachon.sensing.rim_search import power_of_squares
 from pachon.sensing.star_errors import ErrorParts
@@ -200,6 +202,21 @@ def test_scatter_of_donuts_beyond_their_errors_is_air_of_which_they_share_a_part
     assert np.sqrt(np.trace(apart[0].total)) == pytest.approx(20e-9)
 
 
+@pytest.mark.parametrize(("rms", "further"), [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (1.0, 0.2)])
+def test_air_is_told_from_what_telescopes_have_by_how_it_falls_off(rms, further):
+    """Amplitudes drawn: the likeliest rms is that of the air, however much less the telescope has than expected."""
+    rng = np.random.default_rng(9)
+    # Air falls off faster with the order than what telescopes have.
+    variances, expected = 10.0 * np.arange(1.0, 41.0) ** -1.5, np.diag(4.0 * np.arange(1.0, 41.0) ** -0.5)
+    spread = np.sqrt(1.0 + rms**2 * variances + further * np.diag(expected))
+    sizes = [
+        Patterns(np.zeros((0, 40)), rng.normal(0.0, spread), variances).sizes(np.zeros((40, 40)), expected)
+        for _ in range(20)
+    ]
+    likeliest = RMS_LOGARITHMS[np.argmin(np.sum([size.losses for size in sizes], axis=0))]
+    assert np.exp(likeliest) == pytest.approx(rms, rel=0.2) if rms else likeliest < np.log(0.2)
+
+
 def test_donuts_of_one_exposure_claim_one_air():
     rng = np.random.default_rng(8)
     fields, air_rms = rng.uniform(-0.7, 0.7, (10, 2)), np.array([1e-9, 30e-9, 100e-9, 170e-9, 200e-9] * 2)
@@ -251,6 +268,9 @@ def test_noise_and_unit_of_images_need_not_be_known(behind_focus):
     known_noise = pachon.fit_donuts(behind_focus, stamps[:1], [FIELD], WAVELENGTH, sky_variance=SKY, **OPTIONS)
     assert fit.reasons == ["", ""]
     np.testing.assert_allclose(fit.photon_variance, [1.0, 0.4], rtol=0.15)
+    # Light is in the unit of the images, which no one knows for electrons.
+    assert (known_noise.to_table()["flux"].unit, fit.to_table()["flux"].unit) == (u.electron, u.dimensionless_unscaled)
+    assert "image_units" in " ".join(fit.summary())
     np.testing.assert_allclose(fit.background, [0.0, SKY / 2.5], atol=1.0)
     np.testing.assert_allclose(fit.chi2 / fit.n_pixels, 1.0, atol=0.1)
     for zernikes, errors in zip(fit.zernikes, fit.errors, strict=True):

@@ -8,7 +8,7 @@ import pytest
 from pachon.models.zernike_polynomials import annular_zernikes, noll_to_nm
 from pachon.sensing.air_shape import air_shape
 from pachon.sensing.contradicting_donuts import fit_consistently
-from pachon.sensing.hierarchy import Basis, ExposureAir, Observations, fit_hierarchy, star_numbers
+from pachon.sensing.hierarchy import RMS, Basis, ExposureAir, Observations, Sizes, _Model, fit_hierarchy, star_numbers
 
 NOLL = np.arange(4, 12)
 #: Part of the air that donuts share.
@@ -160,3 +160,43 @@ def test_donuts_of_one_star_stand_within_a_distance_or_have_one_name():
     fields = np.array([[0.0, 0.0], [1e-3, 0.0], [1e-5, 0.0], [1e-3, 1e-5]])
     assert star_numbers(fields, 1e-4).tolist() == [0, 1, 0, 1]
     assert star_numbers(fields, 1e-4, [7, 7, 3, 3]).tolist() == [1, 1, 0, 0]
+
+
+@pytest.mark.parametrize("donuts_of_a_star", [1, 2])
+def test_slopes_of_the_loss_are_those_of_differences(donuts_of_a_star):
+    """By the logarithm of each size: a search by differences takes seven times as many evaluations."""
+    rng = np.random.default_rng(5)
+    places = np.repeat(places_of(rng, 4), donuts_of_a_star, axis=0)
+    star = np.repeat(np.arange(4), donuts_of_a_star)
+    exposure = np.arange(len(star)) % donuts_of_a_star
+    observations, _, _ = drawn(rng, places, star=star, exposure=exposure, air=60e-9, local=20e-9)
+    model = _Model(observations, field_basis(places), ExposureAir(shape(), GROUND))
+    at, step = np.log([1.3, 90e-9, 120e-9, np.log(3.5), 6e-9, 12e-9]), 1e-4
+
+    def loss(logarithms):
+        return model.loss(Sizes.of(logarithms))[0]
+
+    differences = [(loss(at + unit) - loss(at - unit)) / (2.0 * step) for unit in step * np.eye(6)]
+    slopes = model.loss(Sizes.of(at))[1]
+    assert np.abs(slopes).min() > 0.01
+    # Second-order differences at this step are off by 1e-7 of the larger slopes.
+    np.testing.assert_allclose(slopes, differences, rtol=1e-6, atol=1e-5)
+
+
+def test_residuals_say_how_much_air_donuts_have_in_common():
+    """Scatter of donuts about a smooth field says nothing of what layers near the ground have in all of them."""
+    rng = np.random.default_rng(6)
+    places, one = places_of(rng, 4), np.zeros(4, dtype=np.int64)
+    observations, _, _ = drawn(rng, places, star=np.arange(4), exposure=one, air=60e-9)
+    without, strong = (ExposureAir(shape(), 0.8, losses=losses) for losses in (None, 20.0 * np.log(RMS / 200e-9) ** 2))
+    assert without.loss(0.0) == (0.0, 0.0)
+    for rms in (20e-9, 200e-9, 2e-6):
+        loss, slope = strong.loss(np.log(rms))
+        ahead, behind = (strong.loss(np.log(rms) + step)[0] for step in (1e-5, -1e-5))
+        assert slope == pytest.approx((ahead - behind) / 2e-5, rel=1e-4, abs=1e-3)
+        assert rms > RMS[-1] or loss == pytest.approx(20.0 * np.log(rms / 200e-9) ** 2, abs=0.2)
+    scattered, told = (fit_hierarchy(observations, field_basis(places), air) for air in (without, strong))
+    assert scattered.sizes.air < 130e-9
+    assert told.sizes.air == pytest.approx(200e-9, rel=0.25)
+    # Errors of the telescope's wavefront have it.
+    assert np.trace(told.telescope_covariance[0]) > 2.0 * np.trace(scattered.telescope_covariance[0])

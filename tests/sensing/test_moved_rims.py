@@ -258,7 +258,7 @@ def test_rims_of_hsc_are_where_its_light_is():
     lit = shadows._ends[-1].status == 0
     for number, surface in enumerate(hsc.surfaces[:-1]):
         smooth, coefficients, _ = shadows._smooth(number)
-        places = smooth.sums(shadows._survey[lit], coefficients)[0]
+        places = smooth.sums(shadows._survey.points[lit], coefficients)[0]
         off = np.abs(places - shadows._places(number, shadows._ends)[lit])
         assert off.max() < 0.1e-3, surface.name
 
