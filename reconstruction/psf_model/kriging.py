@@ -44,8 +44,10 @@ ORDER = 4
 # Variance of a second weight under which pixels keep the shape of the model, over that of the first: near to the
 # weights of adaptive moments and of the paper, while the first, wide one has the least noise of all fields.
 _NARROW = 0.4
-# Light of the core is above the noise by so many standard deviations, and its mean square at least so much [pixel^2].
-_CORE_NOISE, _LEAST_CORE = 5.0, 0.25
+# Light of the core is above the noise by so many standard deviations.
+_CORE_NOISE = 5.0
+# Least mean square of the core [pixel^2]: a star may be one pixel.
+_LEAST_CORE = 0.25
 # Distance from the centre beyond which a stamp is sky, as a fraction of its side.
 _SKY = 0.35
 # Passes after which the noise of the sky, and the mean of stars that are weighted by it, change no more.
