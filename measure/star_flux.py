@@ -19,6 +19,8 @@ _PROFILE_ERROR = 0.2
 _FAINT = 0.1
 # Least noise of a sum, over the flux: that of a star without noise is its sum, whatever the PSF does.
 _LEAST_NOISE = 1e-6
+# A stamp whose sum is negative has a star if the fit is above its noise by so many standard deviations.
+_SIGNIFICANT = 3.0
 
 
 def star_fluxes(
@@ -47,6 +49,8 @@ def star_fluxes(
     profile = median_star(pixels, used) if profile is None else profile
     noise = pixel_noise(pixels, used, profile) if noise is None else noise
     fitted = _fitted(pixels, used, profile)
+    square = (profile**2).sum() if used is None else used @ profile**2
+    dark = fitted * np.sqrt(square) <= _SIGNIFICANT * noise
     if used is None:
         total, noise = pixels.sum(axis=1), noise * np.sqrt(pixels.shape[1])
     else:
@@ -55,7 +59,8 @@ def star_fluxes(
         total, noise = np.where(used, pixels, 0.0).sum(axis=1) / lit, noise * np.sqrt(used.sum(axis=1)) / lit
     least = np.maximum(_LEAST_NOISE * np.abs(fitted), np.finfo(float).tiny)
     reach = fitted * (_PROFILE_ERROR**2 * fitted / np.maximum(noise, least))
-    return np.where(fitted > 0.0, np.clip(total, fitted - reach, fitted + reach), fitted)
+    flux = np.where(fitted > 0.0, np.clip(total, fitted - reach, fitted + reach), fitted)
+    return np.where(dark & (total <= 0.0), np.minimum(flux, 0.0), flux)
 
 
 def pixel_noise(pixels: np.ndarray, used: np.ndarray | None, profile: np.ndarray) -> np.ndarray:
@@ -94,20 +99,19 @@ def with_unit_flux(stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def median_star(pixels: np.ndarray, used: np.ndarray | None = None) -> np.ndarray:
-    """Return the median of stars [n, n_pixels], each over its sum, [n_pixels], of unit sum.
+    """Return the median of stars [n, n_pixels], each over its sum, [n_pixels], of unit sum; zero if no sum is positive.
 
-    Stars of a sum near zero, and pixels that are not the star's, do not move it. Pixels that are not `used` count in no
-    star.
+    Stars of a sum near zero, and pixels that are not the star's, do not move it. Stars of negative sum, which would
+    count upside down, are left out. Pixels that are not `used` count in no star.
     """
-    if used is None:
-        median = column_median(sorted_columns(_over_sums(pixels)))
-    else:
-        median = np.nan_to_num(masked_median(_over_sums(np.where(used, pixels, 0.0)), ~used))
+    images = pixels if used is None else np.where(used, pixels, 0.0)
+    sums = images.sum(axis=1)
+    lit = sums > 0.0
+    if not lit.any():
+        return np.zeros(pixels.shape[1])
+    if not lit.all():
+        images, sums, used = images[lit], sums[lit], None if used is None else used[lit]
+    unit = images / sums[:, None]
+    median = column_median(sorted_columns(unit)) if used is None else np.nan_to_num(masked_median(unit, ~used))
     total = median.sum()
-    return median / (total if total > 0.0 else 1.0)
-
-
-def _over_sums(pixels: np.ndarray) -> np.ndarray:
-    """Return stars over their sums."""
-    total = pixels.sum(axis=1)
-    return np.asarray(pixels / np.where(total == 0.0, 1.0, total)[:, None])
+    return np.asarray(median / (total if total > 0.0 else 1.0))

@@ -44,6 +44,10 @@ ORDER = 4
 # Variance of a second weight under which pixels keep the shape of the model, over that of the first: near to the
 # weights of adaptive moments and of the paper, while the first, wide one has the least noise of all fields.
 _NARROW = 0.4
+# Light of the core is above the noise by so many standard deviations.
+_CORE_NOISE = 5.0
+# Least mean square of the core [pixel^2]: a star may be one pixel.
+_LEAST_CORE = 0.25
 # Distance from the centre beyond which a stamp is sky, as a fraction of its side.
 _SKY = 0.35
 # Passes after which the noise of the sky, and the mean of stars that are weighted by it, change no more.
@@ -270,11 +274,16 @@ def shape_numbers(
 
 
 def core_variance(mean: np.ndarray) -> float:
-    """Return the mean square of the distance from the centre of a PSF's light above a tenth of its peak [pixel^2]."""
+    """Return the mean square of the distance from the centre of a PSF's light above a tenth of its peak [pixel^2].
+
+    Of the mean of faint stars it is the light above the noise, at most above half of the peak.
+    """
     y, x = np.indices(mean.shape) - np.array(mean.shape)[:, None, None] // 2
     # Wings and noise of the outer pixels would make it that of the stamp.
-    core = np.where(mean > 0.1 * mean.max(), mean, 0.0)
-    return float((core * (x * x + y * y)).sum() / core.sum())
+    negative, peak = mean[mean < 0.0], mean.max()
+    noise = np.sqrt((negative**2).mean()) if len(negative) else 0.0
+    core = np.where(mean > np.clip(_CORE_NOISE * noise, 0.1 * peak, 0.5 * peak), mean, 0.0)
+    return max(float((core * (x * x + y * y)).sum() / core.sum()), _LEAST_CORE)
 
 
 def star_noise(

@@ -9,7 +9,8 @@ import numpy as np
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError
-from ...core.statistics import RMS_PER_MAD, column_median, column_percentile, row_medians, sorted_columns
+from ...core.statistics import RMS_PER_MAD, column_percentile, row_medians, sorted_columns
+from ...measure.star_flux import median_star
 
 # Standard deviation of the PSF itself within a CCD: this fraction of the geometric mean of the pixel's value and the
 # peak's. The wings may change by more of themselves than the core.
@@ -102,8 +103,7 @@ def restore_predicted(values: np.ndarray, mean: np.ndarray, rejected: np.ndarray
 def _first_guess(images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the median star [n_pixels] and fluxes [n_stars] by the median of each star's bright pixels."""
     total = images.sum(axis=1)
-    median = column_median(sorted_columns(images / total[:, None]))
-    median /= median.sum()
+    median = median_star(images)
     bright = median > 0.2 * median.max()
     flux = row_medians(images[:, bright] / median[bright])
     return median, np.where(flux > 0.0, flux, total)

@@ -198,7 +198,9 @@ def fit_pixel_fields(
     contrasts = contrasts_of(shape_covariance)
     # Shape numbers of smooth fields may lie near a line, across which stars show nothing: no correction is larger than
     # the response itself.
-    variances = np.minimum(variances_of(residuals, contrasts), (response[:_SHAPE_NUMBERS] ** 2).max() / noise_floor)
+    with np.errstate(over="ignore"):  # stars without any noise have no limit
+        most = (response[:_SHAPE_NUMBERS] ** 2).max() / noise_floor
+    variances = np.minimum(variances_of(residuals, contrasts), most)
     if variances.any():
         if len(brightest) < len(noise):
             contrasts = Contrasts.of(shape_covariance, noise)

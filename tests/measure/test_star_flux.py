@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from pachon import PsfModel
+from pachon.core.errors import DomainError
 from pachon.measure.star_flux import star_fluxes, with_unit_flux
+from pachon.measure.star_selection import StarFlag, flag_stars
 
 SIDE = 49
 
@@ -37,6 +39,28 @@ def test_faint_stars_have_their_flux():
     np.testing.assert_allclose(fluxes, 1.0, atol=0.4)
     assert fluxes.std() < 0.5 * sums.std()
     assert abs(np.median(fluxes) - 1.0) < 0.02
+
+
+def test_stars_of_negative_sum_do_not_turn_the_others():
+    """Sky subtracted by 0.15 of its noise too much: more than half of the stars sum to less than nothing."""
+    stars = faint_stars(60, 30.0, 6)
+    stars -= 0.15 * stars[:, :8].std()
+    stars[:20] += 20.0 * profiles(np.full(20, 1.65))
+    assert (stars.sum(axis=(1, 2)) < 0.0).sum() == 40
+    flux = with_unit_flux(stars)[1]
+    assert (flux[:20] > 10.0).all()
+    assert (flux[20:] > 0.0).all()
+    assert not (flag_stars(stars / stars[:, :8].std(), 1.0).flags & StarFlag.UNUSABLE).any()
+
+
+def test_an_empty_stamp_of_negative_sum_is_no_star():
+    """By chance a fit to noise alone is positive half of the time."""
+    stars = faint_stars(30, 100.0, 7)
+    noise = stars[:, :8].std() * np.random.default_rng(8).normal(size=(200, SIDE, SIDE))
+    dark = noise[noise.sum(axis=(1, 2)) < 0.0]
+    assert np.isnan(with_unit_flux(np.concatenate([stars, dark[:20]]))[1][30:]).all()
+    with pytest.raises(DomainError, match=r"stamps\[30\] has no light"):
+        PsfModel.fit(np.concatenate([stars, dark[:1]]), np.zeros((31, 2)), gain=None)
 
 
 def test_masked_pixels_and_cosmic_rays_do_not_move_the_flux():

@@ -149,20 +149,31 @@ def _field_pupils(telescope: Telescope, projection: Projection, wavelength: floa
     full = np.zeros(len(points))
     full[inside] = 1.0
     full = full.reshape(_CELLS, _CELL_POINTS, _CELLS, _CELL_POINTS).mean(axis=(1, 3))
-    bright = np.flatnonzero((area > _LEAST_LIT * full.sum()).all(axis=1))
+    bright = _lit_rings(area, full)
     rings = [0]
-    for ring in bright[1:] if len(bright) and bright[0] == 0 else ():
+    for ring in range(1, bright):
         between = np.abs(samples[rings[-1] : ring + 1] - samples[rings[-1]]).sum(axis=(2, 3)).max()
         if between > _DIFFERENT * full.sum():
             # The ring before is the last that is like the one chosen, but for a step as long as this.
             rings.append(ring - 1 if ring - 1 > rings[-1] else ring)
     if len(rings) == 1:
         return None
-    radius = radius[np.unique([*rings, bright[-1]])]
-    nodes = light(radius[1:], _NODE_DIRECTIONS).reshape(-1, _CELLS, _CELLS)
+    radius = radius[np.unique([*rings, bright - 1])]
+    of_rings = light(radius[1:], _NODE_DIRECTIONS)
+    # Between the directions of the samples it may be dark.
+    bright = _lit_rings(of_rings.sum(axis=(2, 3)), full)
+    if not bright:
+        return None
+    radius, nodes = radius[: bright + 1], of_rings[:bright].reshape(-1, _CELLS, _CELLS)
     direction = field_direction(radius, 0.0 * radius, projection)
     slope = direction[:, 0] / -direction[:, 2]
     return FieldPupils(np.abs(slope), _NODE_DIRECTIONS, diameter, np.concatenate([samples[0, :1], nodes]), full)
+
+
+def _lit_rings(area: np.ndarray, full: np.ndarray) -> int:
+    """Return how many rings of stars, whose light is [n_ring, n_direction], lie within the first with a dark pupil."""
+    lit = (area > _LEAST_LIT * full.sum()).all(axis=1)
+    return len(lit) if lit.all() else int(lit.argmin())
 
 
 def _middle_wavelength(inputs: PsfInputs) -> float:

@@ -324,3 +324,15 @@ def test_stamps_that_are_not_in_electrons_are_noticed():
         PsfModel.fit(stars, places, **OPTIONS, weights=np.ones(12))
     with pytest.raises(DomainError, match="expected places apart for interpolation = 'kriging'"):
         PsfModel.fit(stars, np.vstack([places[:11], places[:1]]), **OPTIONS)
+
+
+def test_noise_of_faint_stars_is_no_part_of_their_core():
+    """Outer pixels of their mean, a tenth of the peak by noise, made the weight of its shapes that of the stamp."""
+    y, x = np.indices((49, 49)) - 24
+    truth = (1.0 + (x**2 + y**2) / 9.0) ** -3.0
+    expected = kriging.core_variance(truth)
+    for seed in range(5):
+        noisy = truth + 0.06 * np.random.default_rng(seed).normal(size=truth.shape)
+        assert 0.4 * expected < kriging.core_variance(noisy) < 1.5 * expected
+    # A star of one pixel has a weight too.
+    assert kriging.core_variance(np.where(x**2 + y**2 > 0, 0.0, 1.0)) > 0.0

@@ -8,6 +8,7 @@ import pytest
 import pachon
 from pachon.models.ideal_telescope import ideal_telescope
 from pachon.raytrace.rays import field_direction
+from pachon.wavefront.psf import pupil_means
 from pachon.wavefront.psf.clear_pupil import lit_fractions
 from pachon.wavefront.psf.psf import psf_inputs
 from pachon.wavefront.psf.pupil_means import PupilMeans
@@ -104,3 +105,21 @@ def test_optics_without_aberrations(telescope):
     assert got.aberration == pytest.approx(np.zeros(13), abs=1e-16)
     assert np.isfinite(got.relative_square(np.zeros((1, 2)))).all()
     assert len(got.lit_levels) == 1
+
+
+@pytest.mark.parametrize("dark", ["diagonals", "ring"])
+def test_rings_end_before_dark_pupils(monkeypatch, dark):
+    """Light may be lost between the directions that are looked at, or in the middle of the field alone."""
+
+    def lit(telescope, directions, wavelength, points, threads):
+        x, y = (directions[:, :2] / telescope.field_radius).T
+        radius = np.hypot(x, y)
+        lost = np.minimum(np.abs(x), np.abs(y)) > 0.5 if dark == "diagonals" else np.abs(radius - 0.8) < 0.04
+        inside = points[None, :, 0] < telescope.pupil_diameter * (0.5 - 0.4 * radius[:, None])
+        return np.where(lost[:, None], 0.0, inside)
+
+    telescope = pachon.load_telescope("hsc")
+    monkeypatch.setattr(pupil_means, "lit_points", lit)
+    pupils = pupil_means._field_pupils.__wrapped__(telescope, "gnomonic", 760e-9)
+    assert (pupils.light.sum(axis=(1, 2)) > 0.05 * pupils.full.sum()).all()
+    assert 0.5 < pupils.radius[-1] / telescope.field_radius < 0.8
