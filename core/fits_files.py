@@ -6,6 +6,7 @@ import bz2
 import gzip
 import io
 import lzma
+import re
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
@@ -26,6 +27,8 @@ _UNPACKED = 128 * 2**20
 _RATIO = 10
 #: Bytes to which one image of a tile-compressed file (fpack) may unpack.
 _TILED = 2**30
+# What astropy says of a card.
+_UNPARSABLE = re.compile(r"Unparsable card \((\S+)\)")
 #: Bytes that are unpacked at once.
 _PIECE = 2**20
 
@@ -40,8 +43,8 @@ def open_fits(
     to 1 GiB and to the memory that is free: a few bytes can stand for as many gigabytes. Other options are those of
     ``astropy.io.fits.open``.
 
-    Raises `error` where it unpacks to more; whatever astropy raises for a damaged file passes, its warning of one cut
-    short among them.
+    Raises `error` where it unpacks to more, or a card that is asked for meanwhile cannot be read; whatever else astropy
+    raises for a damaged file passes, its warning of one cut short among them.
     """
     from astropy.io import fits  # few prescriptions have a grid, and it takes long to import
 
@@ -49,11 +52,28 @@ def open_fits(
         require_file(path, error)
     with open(path, "rb") if content is None else io.BytesIO(content) as packed:
         stream = _unpacked(path, packed, error)
-        with _short_files_refused(), fits.open(packed if stream is None else stream, **options) as hdus:
+        with (
+            _short_files_refused(),
+            readable_cards(path, error),
+            fits.open(packed if stream is None else stream, **options) as hdus,
+        ):
             for hdu in hdus:
                 if isinstance(hdu, fits.CompImageHDU):
                     _require_room(path, hdu, error)
             yield hdus
+
+
+@contextmanager
+def readable_cards(path: Path, error: type[PachonError]) -> Iterator[None]:
+    """Raise `error` for a card of a header that astropy cannot read, which it does when it is asked for."""
+    from astropy.io import fits
+
+    try:
+        yield
+    except fits.VerifyError as cause:
+        card = _UNPARSABLE.search(str(cause))
+        name = "a card" if card is None else card[1]
+        raise error(f"{name} of the header cannot be read: expected KEY = value as FITS has it", file=path) from None
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import ProductError, shown
 from ..core.files import parsing, require_file
-from ..core.fits_files import open_fits
+from ..core.fits_files import open_fits, readable_cards
 from ..core.units import require_count
 from .psf_model.polynomial import as_positions
 
@@ -108,6 +108,12 @@ def load_psfex(path: str | Path) -> PsfexPsf:
                 raise ProductError(f"no model of PSFEx (no table with {_COLUMN})", file=file)
             header = tables[0].header
             images = np.asarray(tables[0].data[_COLUMN][0], dtype=np.float64)
+    with readable_cards(file, ProductError):
+        return _of_header(header, images, file)
+
+
+def _of_header(header: fits.Header, images: np.ndarray, file: Path) -> PsfexPsf:
+    """Return the model of images with the polynomial that a header describes."""
     groups = _number(header, "POLNAXIS", file, 0)
     if groups not in (0, 2):
         raise ProductError(

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
+from ...core.fits_files import readable_cards
 from ...core.noise_planes import NoiseKind
 from ...core.units import ARCSEC, positive_angle, require_positive
 from ...measure.pixel_masks import clipped_level, empty_pixels
@@ -168,7 +169,8 @@ def load_image(path: str | Path, *, extension: str | None = None, settings: Imag
     if len(images) > 1:
         names = ", ".join(file.label(planes.image) for planes in images)
         raise ProductError(f"has {len(images)} images: expected extension = one of {names}", file=path, key="extension")
-    return _image_of(file, images[0], settings)
+    with readable_cards(path, ProductError):
+        return _image_of(file, images[0], settings)
 
 
 def _is_own(file: FitsParts) -> bool:

@@ -148,7 +148,7 @@ def _quadratic_range(polynomial: np.ndarray) -> tuple[float, float]:
 
 
 def _raft(camera: Camera, budget: HeightBudget, seed: int) -> np.ndarray:
-    half = 0.5 * budget.raft_height
+    half = abs(0.5 * budget.raft_height)
     pistons = np.array([stream(seed, "focal plane", "raft", name).uniform(-half, half) for name in camera.raft_names])
     polynomial = np.zeros((len(camera), 10))
     # Index -1, of CCDs without a raft, is that of the zero at the end.
@@ -157,14 +157,14 @@ def _raft(camera: Camera, budget: HeightBudget, seed: int) -> np.ndarray:
 
 
 def _ccd(camera: Camera, budget: HeightBudget, seed: int) -> np.ndarray:
-    half = 0.5 * budget.ccd_height
+    half = abs(0.5 * budget.ccd_height)
     polynomial = np.zeros((len(camera), 10))
     polynomial[:, 0] = [stream(seed, "focal plane", "ccd", name).uniform(-half, half) for name in camera.ccd_names]
     return polynomial
 
 
 def _tilt(camera: Camera, budget: HeightBudget, seed: int) -> np.ndarray:
-    half = 0.5 * budget.ccd_tilt
+    half = abs(0.5 * budget.ccd_tilt)
     angles = [stream(seed, "focal plane", "tilt", name).uniform(-half, half, 2) for name in camera.ccd_names]
     polynomial = np.zeros((len(camera), 10))
     polynomial[:, 1:3] = camera.half_sizes * np.tan(angles)

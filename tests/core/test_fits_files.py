@@ -112,3 +112,17 @@ def test_large_images_of_fpack_are_refused_by_their_header(tmp_path, monkeypatch
     message = r"tiles\.fits\.fz: compressed image MASK of 0\.5 MB"
     with pytest.raises(ProductError, match=message), open_fits(path, ProductError):
         pass
+
+
+def test_cards_that_cannot_be_read_are_named(tmp_path):
+    """Astropy reads a card when it is asked for."""
+    path = tmp_path / "damaged.fits"
+    hdu = fits.PrimaryHDU(np.zeros((2, 2)))
+    hdu.header["CTYPE2"] = "DEC--TAN"
+    hdu.writeto(path)
+    path.write_bytes(path.read_bytes().replace(b"'DEC--TAN'", b"'DEC--\x07AN "))
+    with (
+        pytest.raises(ProductError, match=r"damaged\.fits: CTYPE2 of the header cannot be read: expected KEY = value"),
+        open_fits(path, ProductError) as hdus,
+    ):
+        assert hdus[0].header["CTYPE2"]

@@ -421,3 +421,10 @@ def test_factors_that_mean_nothing_are_refused():
         FocalPlane.from_budget(seed=1).scaled({"wobble": 1.0})
     with pytest.raises(DomainError, match=r"^factors = nan"):
         plane.scaled(float("nan"))
+
+
+def test_heights_of_minus_zero_are_none():
+    """NumPy draws no numbers between 0 and -0."""
+    budget = replace(SIMULATED, raft_height=-0.0, ccd_height=-0.0, ccd_tilt=-0.0)
+    drawn = FocalPlane.from_budget("lsst", seed=1, terms=["raft", "ccd", "tilt"], budget=budget)
+    assert not drawn.polynomial.any()
