@@ -34,6 +34,7 @@ from .options import (
     TruthStars,
     name_list,
     one_name_list,
+    refuse_stated,
 )
 from .tables import Rows, print_json, wide_console, write_rows
 from .verdicts import attribution_verdict, diagnose_verdict, piff_verdict
@@ -89,13 +90,12 @@ def diagnose_command(
         piff_rows,
     )
 
-    of_stars: dict[str, tuple[object, object]] = {"chip": (chip, None), "images": (images, None)}
-    of_stars |= {"x": (x, "x"), "y": (y, "y"), "stamp": (stamp, "stamp")}
-    of_stars |= {"min-snr": (min_snr, 20.0), "gain": (gain, 1.0)}
-    stated = [f"--{name}" for name, (value, default) in of_stars.items() if value != default]
-    if piff is None and stated:
-        raise ConfigError(f"{stated[0]}: expected --piff with it, whose stars the table has")
-    if piff is not None and strict:
+    if piff is None:
+        of_stars = {"--chip": chip is not None, "--images": images is not None}
+        of_stars |= {"--x": x != "x", "--y": y != "y", "--stamp": stamp != "stamp"}
+        of_stars |= {"--min-snr": min_snr != 20.0, "--gain": gain != 1.0}
+        refuse_stated(of_stars, ": expected --piff with it, whose stars the table has")
+    elif strict:
         raise ConfigError("--strict with --piff: expected none, a table of stars has no CCDs")
     if piff is not None:
         columns = {"x": x, "y": y, "stamp": stamp, "images": images}

@@ -26,6 +26,7 @@ from .options import (
     Threads,
     Weights,
     recipe_of_options,
+    refuse_stated,
 )
 from .tables import Rows, print_json, write_rows
 from .verdicts import measure_verdict
@@ -151,9 +152,8 @@ def measure_command(
         "--mask": mask,
     }
     of_ccd |= {"--gain": gain, "--saturation": saturation}
-    stated = [name for name, value in of_ccd.items() if value is not None]
-    if model != "ccd" and stated:
-        raise ConfigError(f"{stated[0]}: expected with --model ccd alone")
+    if model != "ccd":
+        refuse_stated(of_ccd, ": expected with --model ccd alone")
     if model == "ccd" and telescope is not None:
         raise ConfigError("--telescope: expected with --model focal_plane alone")
     if out is not None:

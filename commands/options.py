@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -225,6 +225,13 @@ def wavelength_list(
     if across_band:
         return np.linspace(*(telescope.band or telescope.wavelength_range), across_band)
     return np.array(wavelengths_nm) * 1e-9 if wavelengths_nm else None
+
+
+def refuse_stated(options: Mapping[str, object], text: str) -> None:
+    """Raise a ConfigError of the first of some options that is stated, its name and a text; None and False are not."""
+    for name, value in options.items():
+        if value is not None and value is not False:
+            raise ConfigError(f"{name}{text}")
 
 
 def picture_kind(picture: Path | None, no_picture: bool = False) -> str:

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 from typer import Argument
 
-from ..core.errors import ConfigError, PrescriptionWarning
+from ..core.errors import PrescriptionWarning
 from ..core.number_text import counted
 from ..core.terminal import print_line
 from . import completion
 from .choices import choice, names
 from .imports import import_modules
 from .inputs import load_model, warnings_shown
-from .options import Configuration, GlassCatalogues, Json, Lenient, Model, TableFile
+from .options import Configuration, GlassCatalogues, Json, Lenient, Model, TableFile, refuse_stated
 from .tables import Rows, plain_table, print_json, wide_console
 
 if TYPE_CHECKING:
@@ -51,10 +51,13 @@ def info_command(
     - `pachon info my_telescope.yaml --json`
     """
     console = wide_console()
-    of_model = {"--glass-catalogue": glass_catalogue, "--lenient": lenient, "--configuration": configuration}
-    if model is None and (stated := [name for name, value in of_model.items() if value]):
-        raise ConfigError(f"{stated[0]}: expected MODEL with it")
     if model is None:
+        of_model = {
+            "--glass-catalogue": glass_catalogue or None,
+            "--lenient": lenient,
+            "--configuration": configuration or None,
+        }
+        refuse_stated(of_model, ": expected MODEL with it")
         from ..models.io.bundled import bundled_models
 
         models = bundled_models()

@@ -14,7 +14,19 @@ from ..core.terminal import print_line
 from . import completion
 from .choices import names
 from .night import Bands, ListFile, Night, Where, names_list, night_settings, part_of, require_list, show_night
-from .options import AllCcds, Ccds, Config, Json, Quiet, Raft, TableFile, Threads, chosen_ccds, set_option
+from .options import (
+    AllCcds,
+    Ccds,
+    Config,
+    Json,
+    Quiet,
+    Raft,
+    TableFile,
+    Threads,
+    chosen_ccds,
+    refuse_stated,
+    set_option,
+)
 from .tables import Rows, print_json, write_rows
 from .verdicts import null_verdict, visits_verdict
 from .workers import DaskWorkers, Processes, Scheduler, long_work
@@ -135,12 +147,10 @@ def visits_command(
             "--models": models,
         }
         excluded |= {"--count": count, "--dither-deg": dither_deg, "--roll": roll, "--rotator": rotator}
-        if stated := [option for option, value in excluded.items() if value is not None]:
-            raise ConfigError(f"{stated[0]} with --stack: expected none")
+        refuse_stated(excluded, " with --stack: expected none")
     elif visit_list is not None or (config is not None and names_list(config)):
         stack_options = {"--count": count, "--dither-deg": dither_deg, "--roll": roll, "--rotator": rotator}
-        if stated := [option for option, value in stack_options.items() if value is not None]:
-            raise ConfigError(f"{stated[0]} with a list: expected none, visits of a list have their own")
+        refuse_stated(stack_options, " with a list: expected none, visits of a list have their own")
         night_config = night_settings(
             config,
             settings,
@@ -178,13 +188,11 @@ def visits_command(
         visits__rotator_deg=angles_of("--rotator", rotator),
     )
     folder = None if config is None else config.parent
-    named_list = visits_config.visits.from_list
     if visit_list is not None:
         listed = ListSection(list=str(visit_list.absolute()), where=where, band=band, night=night)
         visits_config = visits_config.with_list(listed, folder)
-    elif named_list is not None and named_list.digest is None:
-        # Written by hand; that of a stack that was begun has all that follows from its list.
-        visits_config = visits_config.with_list(named_list, folder)
+    else:
+        visits_config = visits_config.with_named_list(folder)
     experiment = visits_config.experiment(folder)
     hint = f"finished visits are in {out}, and --resume goes on from there"
     with long_work(

@@ -47,14 +47,13 @@ def star_fluxes(
         Of a pixel of each star, [n]; by default :func:`pixel_noise`.
     """
     profile = median_star(pixels, used) if profile is None else profile
-    noise = pixel_noise(pixels, used, profile) if noise is None else noise
-    fitted = _fitted(pixels, used, profile)
-    square = (profile**2).sum() if used is None else used @ profile**2
+    fitted, square = fitted_fluxes(pixels, used, profile)
+    noise = _noise_beside(pixels, used, fitted, profile) if noise is None else noise
     dark = fitted * np.sqrt(square) <= _SIGNIFICANT * noise
     if used is None:
         total, noise = pixels.sum(axis=1), noise * np.sqrt(pixels.shape[1])
     else:
-        lit = used @ profile
+        lit = np.where(used, profile, 0.0).sum(axis=1)
         lit = np.where(lit > 0.0, lit, 1.0)
         total, noise = np.where(used, pixels, 0.0).sum(axis=1) / lit, noise * np.sqrt(used.sum(axis=1)) / lit
     least = np.maximum(_LEAST_NOISE * np.abs(fitted), np.finfo(float).tiny)
@@ -65,23 +64,32 @@ def star_fluxes(
 
 def pixel_noise(pixels: np.ndarray, used: np.ndarray | None, profile: np.ndarray) -> np.ndarray:
     """Return the rms noise of the faint pixels of each star, [n], with arguments of :func:`star_fluxes`."""
+    return _noise_beside(pixels, used, fitted_fluxes(pixels, used, profile)[0], profile)
+
+
+def _noise_beside(pixels: np.ndarray, used: np.ndarray | None, fluxes: np.ndarray, profile: np.ndarray) -> np.ndarray:
+    """Return the rms noise of the faint pixels beside stars of given fluxes, [n]."""
     faint = profile < _FAINT * profile.max()
     if not faint.any():
         return np.zeros(len(pixels))
-    deviations = np.abs(pixels[:, faint] - _fitted(pixels, used, profile)[:, None] * profile[faint])
+    deviations = np.abs(pixels[:, faint] - fluxes[:, None] * profile[faint])
     if used is None:
         return RMS_PER_MAD * row_medians(deviations)
     return RMS_PER_MAD * np.nan_to_num(finite_row_medians(np.where(used[:, faint], deviations, np.nan)))
 
 
-def _fitted(pixels: np.ndarray, used: np.ndarray | None, profile: np.ndarray) -> np.ndarray:
-    """Return the fluxes of stars by least squares, [n]; their sums under a profile without light."""
-    if not profile.any():
-        return np.asarray((pixels if used is None else np.where(used, pixels, 0.0)).sum(axis=1))
+def fitted_fluxes(pixels: np.ndarray, used: np.ndarray | None, profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the fluxes of stars by least squares, and the sums of squares of the profile in their used pixels, [n].
+
+    Under a profile without light fluxes are sums.
+    """
     if used is None:
-        return np.asarray((pixels * profile).sum(axis=1) / (profile**2).sum())
-    square = used @ profile**2
-    return np.asarray((np.where(used, pixels, 0.0) * profile).sum(axis=1) / np.where(square > 0.0, square, 1.0))
+        values, square = pixels, np.full(len(pixels), (profile**2).sum())
+    else:
+        values, square = np.where(used, pixels, 0.0), np.where(used, profile**2, 0.0).sum(axis=1)
+    if not profile.any():
+        return np.asarray(values.sum(axis=1)), square
+    return np.asarray((values * profile).sum(axis=1) / np.where(square > 0.0, square, 1.0)), square
 
 
 def with_unit_flux(stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -44,7 +44,7 @@ _WAVELENGTHS = 5
 #: Largest number of CCDs of a camera that is computed whole by default.
 _FEW = 9
 #: Site of telescopes that name none.
-_SITE = "cerro_pachon"
+SITE = "cerro_pachon"
 # The optics alone as in Fig. 8 of Jee & Tyson 2011: without charge diffusion, which would dilute most of their
 # ellipticity, and on pixels fine enough for a weight of 0.3", a quarter of those of the CCDs.
 _WITH_ATMOSPHERE = {"n_pupil": PUPIL_POINTS, "diffusion_pixels": 0.4}
@@ -92,7 +92,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
         camera_name = _absolute_path(config.camera, folder, CAMERAS, CAMERA_ENDINGS)
     camera = _camera_of(telescope, camera_name)
     atmosphere = config.atmosphere
-    site_name = _absolute_path(atmosphere.site or telescope.site or _SITE, folder, ())
+    site_name = _absolute_path(atmosphere.site or telescope.site or SITE, folder, ())
     plane = config.focal_plane
     if plane.heights is not None:
         heights = _absolute_path(plane.heights, folder, tuple(AS_MEASURED), HEIGHT_ENDINGS)

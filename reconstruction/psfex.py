@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import ProductError, shown
 from ..core.files import parsing, require_file
-from ..core.fits_files import open_fits, readable_cards
+from ..core.fits_files import open_fits
 from ..core.units import require_count
 from .psf_model.polynomial import as_positions
 
@@ -106,10 +106,7 @@ def load_psfex(path: str | Path) -> PsfexPsf:
             tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU) and _COLUMN in hdu.columns.names]
             if not tables:
                 raise ProductError(f"no model of PSFEx (no table with {_COLUMN})", file=file)
-            header = tables[0].header
-            images = np.asarray(tables[0].data[_COLUMN][0], dtype=np.float64)
-    with readable_cards(file, ProductError):
-        return _of_header(header, images, file)
+            return _of_header(tables[0].header, np.asarray(tables[0].data[_COLUMN][0], dtype=np.float64), file)
 
 
 def _of_header(header: fits.Header, images: np.ndarray, file: Path) -> PsfexPsf:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -103,10 +104,14 @@ class ExposureAir:
         """Return what residuals say of the logarithm of an rms, and its slope; nothing below the least one."""
         if self.losses is None:
             return 0.0, 0.0
-        inside = float(np.clip(logarithm, *np.log(RMS[[0, -1]])))
-        curve = PchipInterpolator(np.log(RMS), self.losses)
-        slope = float(curve(inside, 1)) if logarithm >= inside else 0.0
-        return float(curve(inside)) + slope * (logarithm - inside), slope
+        inside = float(np.clip(logarithm, *self._curve.x[[0, -1]]))
+        slope = float(self._curve(inside, 1)) if logarithm >= inside else 0.0
+        return float(self._curve(inside)) + slope * (logarithm - inside), slope
+
+    @cached_property
+    def _curve(self) -> PchipInterpolator:
+        """Losses by the logarithm of the rms."""
+        return PchipInterpolator(np.log(RMS), self.losses)
 
 
 @dataclass(frozen=True)

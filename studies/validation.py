@@ -70,10 +70,8 @@ def _load_images(path: Path) -> None:
 
 
 def _load_visits(path: Path) -> None:
-    config, folder = load_visits_configuration(path), path.parent
-    named = config.visits.from_list
-    if named is not None and named.digest is None:
-        config = config.with_list(named, folder)
+    folder = path.parent
+    config = load_visits_configuration(path).with_named_list(folder)
     config.experiment(folder)
     config.plan(config.run.seed)
 

@@ -165,11 +165,13 @@ def load_image(path: str | Path, *, extension: str | None = None, settings: Imag
     file = FitsParts.of(path)
     if settings == ImageSettings() and extension is None and _is_own(file):
         return CcdImage.read(path)
-    images = planes_of(file, extension)
-    if len(images) > 1:
-        names = ", ".join(file.label(planes.image) for planes in images)
-        raise ProductError(f"has {len(images)} images: expected extension = one of {names}", file=path, key="extension")
     with readable_cards(path, ProductError):
+        images = planes_of(file, extension)
+        if len(images) > 1:
+            names = ", ".join(file.label(planes.image) for planes in images)
+            raise ProductError(
+                f"has {len(images)} images: expected extension = one of {names}", file=path, key="extension"
+            )
         return _image_of(file, images[0], settings)
 
 

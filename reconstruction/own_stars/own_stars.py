@@ -14,12 +14,12 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.number_text import counted
 from ...core.random_streams import stream
-from ...core.statistics import finite_median, median_image
+from ...core.statistics import finite_median
 from ...core.units import positive_angle, real_array, require_positive, require_seed
 from ...measure.pixel_masks import clipped_stars, fill_symmetric
 from ...measure.shapes import fwhm, measure_shapes
 from ...measure.stamps import center_masks, decenter_masks, shift_to_middle
-from ...measure.star_flux import with_unit_flux
+from ...measure.star_flux import fitted_fluxes, median_star, with_unit_flux
 from ...measure.star_selection import StarFlag, flag_stars, require_stars
 from ..psf_model import kriging
 from ..psf_model.checks import as_extent
@@ -283,8 +283,8 @@ class _CentredStars:
         with_defects = (self.flags != 0) & ((self.flags & ~_MASKABLE) == 0)
         if not len(good) or not with_defects.any():
             return np.zeros(len(self.flags), dtype=bool)
-        median_star = median_image(good / good.sum(axis=(1, 2), keepdims=True))
-        return with_defects & apart_from_core(defects, median_star, sigma)
+        star = median_star(good.reshape(len(good), -1)).reshape(good.shape[1:])
+        return with_defects & apart_from_core(defects, star, sigma)
 
     def usable_ones(self, usable: np.ndarray) -> _CentredStars:
         """Return the stars with those flagged, and left out, that have no shape."""
@@ -307,14 +307,11 @@ def _require_used(stars: _CentredStars, min_snr: float, gain: float) -> None:
 
 def _flux_and_snr(stamps: np.ndarray, rms: np.ndarray, gain: float) -> tuple[np.ndarray, np.ndarray]:
     """Return flux and S/N of PSF photometry, [n], with the median star as the PSF; NaN where there is no light."""
-    total = stamps.sum(axis=(1, 2))
-    bright = total > 0.0
-    if not bright.any():
+    pixels = stamps.reshape(len(stamps), -1)
+    psf = median_star(pixels)
+    if not psf.any():
         return np.full(len(stamps), np.nan), np.full(len(stamps), np.nan)
-    psf = median_image(stamps[bright] / total[bright, None, None])
-    psf /= psf.sum()
-    squares = (psf**2).sum()
     # The sum over a wide stamp has ten times the noise of the fit.
-    flux = (stamps * psf).sum(axis=(1, 2)) / squares
+    flux, squares = fitted_fluxes(pixels, None, psf)
     flux = np.where(flux > 0.0, flux, np.nan)
     return flux, flux / np.sqrt(flux / gain + rms**2 / squares)

@@ -113,9 +113,7 @@ def _star_field(
     interpolation.check_terms(terms[:, : term_count(needed_order)], needed_order, points, star_weights)
     stars = cleaned_stars(images, bad, smooth_terms, clipping)
     masked = bad if bad.any() else None
-    if interpolation.needs_noise and gain is not None:
-        kriging.require_electrons(stars.flux * gain, gain)
-    electrons = _electrons(stars.flux, gain)
+    electrons = _electrons(stars.flux, gain, needed=interpolation.needs_noise)
     chosen_order, basis_weights = orders[-1], None
     if by_noise or automatic:
         mean = stars.mean.reshape(ny, nx)
@@ -145,6 +143,13 @@ def _check_gain(gain: float | None) -> None:
         raise ConfigError(f"gain = {gain}: expected a number of electrons above 0, or None for no photon noise")
 
 
-def _electrons(flux: np.ndarray, gain: float | None) -> np.ndarray | None:
-    """Return the electrons of stars, [n]; None for stamps that are not in electrons, whose photon noise is unknown."""
-    return flux * gain if gain is not None and np.median(flux) * gain >= kriging.FEWEST_ELECTRONS else None
+def _electrons(flux: np.ndarray, gain: float | None, *, needed: bool) -> np.ndarray | None:
+    """Return the electrons of stars, [n]; None for stamps that are not in electrons, whose photon noise is unknown.
+
+    DomainError for such ones where photon noise is needed; none is asked for without a gain.
+    """
+    if gain is None:
+        return None
+    if needed:
+        kriging.require_electrons(flux * gain, gain)
+    return flux * gain if np.median(flux) * gain >= kriging.FEWEST_ELECTRONS else None

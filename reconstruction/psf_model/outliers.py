@@ -10,7 +10,7 @@ import numpy as np
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError
 from ...core.statistics import RMS_PER_MAD, column_percentile, row_medians, sorted_columns
-from ...measure.star_flux import median_star
+from ...measure.star_flux import fitted_fluxes, median_star
 
 # Standard deviation of the PSF itself within a CCD: this fraction of the geometric mean of the pixel's value and the
 # peak's. The wings may change by more of themselves than the core.
@@ -81,7 +81,7 @@ def find_outliers(images: np.ndarray, clip_sigma: float, max_iterations: int) ->
         good[:, rejected.all(axis=0)] = True
         mean = np.where(good, images / flux[:, None], 0.0).sum(axis=0) / good.sum(axis=0)
         mean /= mean.sum()
-        flux = (images * mean * good).sum(axis=1) / (mean**2 * good).sum(axis=1)
+        flux = fitted_fluxes(images, good, mean)[0]
     return rejected
 
 

@@ -21,6 +21,7 @@ from ...core.errors import ConfigError, ProductError
 from ...core.files import path_beside
 from ...core.schema import Section, Switch, Whole, plain_number, validated
 from ...pipeline.config import Configuration, digest, read_configuration, section_yaml, with_run
+from ...pipeline.defaults import SITE
 from ...pipeline.experiment import Experiment
 from ...sky.visit_list.read_list import read_visit_list
 from ...sky.visit_list.visit_list import VisitList
@@ -28,14 +29,8 @@ from ...sky.visit_list.visit_list import VisitList
 #: Least and most numbers of pixels along a side of a base pixel: the coverage map's, and that of LSST's maps.
 _LEAST_SIDE = 32
 _MOST_SIDE = 32768
-
-
 #: Keys of a list that say which file and which visits of it are taken: their digest tells the visits.
 SELECTION_KEYS = ("list", "where", "band", "night")
-
-
-#: Site of telescopes that have none, as of a run.
-_SITE = "cerro_pachon"
 
 
 class ListSection(Section):
@@ -194,11 +189,11 @@ def _air_of(run: Configuration, folder: Path | None) -> tuple[str, float | None,
     telescope = None if run.telescope is None else load_telescope(from_folder(run.telescope))
     place = None if telescope is None else telescope.site
     if place is None and run.telescope in (None, *TELESCOPES):
-        place = _SITE
+        place = SITE
     if site is None and place not in BUNDLED:
         site = place
     if site is not None and outer_scale is None:
         outer_scale = float(load_site(from_folder(site)).outer_scale)
     if place in BUNDLED:
         return place, outer_scale, ""
-    return _SITE, outer_scale, f"telescope {run.telescope} has no bundled site: place of {_SITE} is taken"
+    return SITE, outer_scale, f"telescope {run.telescope} has no bundled site: place of {SITE} is taken"

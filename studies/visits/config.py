@@ -171,6 +171,14 @@ class VisitsConfig(Section):
         except DomainError as error:
             raise ConfigError(f"visits.{error}") from None
 
+    def with_named_list(self, folder: Path | None = None) -> VisitsConfig:
+        """Return these settings with all that follows from the list that they name, as :meth:`with_list` does.
+
+        Those of a stack that was begun have it already, those without a list have nothing to add.
+        """
+        named = self.visits.from_list
+        return self if named is None or named.digest is not None else self.with_list(named, folder)
+
     def with_list(self, section: ListSection, folder: Path | None = None) -> VisitsConfig:
         """Return the settings of the visits of a list of one field, whose run has their band, pointing and time.
 

@@ -159,10 +159,8 @@ def draw_exposure(
     grid = FieldGrid.of(air, field_radius)
     factors, shared, by_optics = moment_spectrum(air, response, grid)
     random = stream(seed, "atmosphere", epoch, "moments")
-    normal = random.standard_normal(3)
-    if response.pupils is not None:
-        of_nodes = stream(seed, "atmosphere", epoch, "pupils").standard_normal(len(shared) - 3)
-        normal = np.concatenate([normal, of_nodes])
+    of_nodes = stream(seed, "atmosphere", epoch, "pupils").standard_normal(len(shared) - 3)
+    normal = np.concatenate([random.standard_normal(3), of_nodes])
     of_pupils = GroundMoments.draw(shared, response.pupils, normal)
     modes = [_white_modes(random, grid.size, grid.size // 2 + 1, grid.size) for _ in range(3)]
     moments = _fields((sum(f * m for f, m in zip(row, modes, strict=False)) for row in factors), 3, grid.size)

@@ -103,11 +103,7 @@ def _lit_levels(telescope: Telescope, projection: Projection, wavelength: float)
     """Return :attr:`PupilMeans.lit_levels` at a wavelength [m]."""
     pupil = spiral_annulus(0.5 * telescope.pupil_diameter, telescope.pupil_obscuration, _LIGHT_POINTS).points
     near = _steps_of_pairs(pupil, telescope.pupil_diameter)
-    angle = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
-    unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    radius = _radii(telescope)
-    x, y = (radius[:, None, None] * unit).reshape(-1, 2).T
-    lit = lit_points(telescope, field_direction(x, y, projection), wavelength, pupil, 1)
+    lit = _lit_on_rings(telescope, projection, wavelength, _radii(telescope), _DIRECTIONS, pupil)
     fraction = lit.mean(axis=1)
     lit = lit[fraction > _LEAST_LIT]
     if not len(lit):
@@ -125,6 +121,23 @@ def _radii(telescope: Telescope) -> np.ndarray:
     return np.unique(np.minimum(telescope.field_radius * _RADII, _LARGEST_RADIUS))
 
 
+def _lit_on_rings(
+    telescope: Telescope,
+    projection: Projection,
+    wavelength: float,
+    radius: np.ndarray,
+    directions: int,
+    points: np.ndarray,
+) -> np.ndarray:
+    """Return at which points of the pupil [n_point, 2] light of stars on rings passes, [n_star, n_point] bool.
+
+    Stars stand on rings of radii [rad], ring by ring, evenly in so many directions from +x.
+    """
+    angle = 2.0 * np.pi * np.arange(directions) / directions
+    x, y = (radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)).reshape(-1, 2).T
+    return lit_points(telescope, field_direction(x, y, projection), wavelength, points, 1)
+
+
 @lru_cache(maxsize=16)
 def _field_pupils(telescope: Telescope, projection: Projection, wavelength: float) -> FieldPupils | None:
     """Return :attr:`PupilMeans.pupils` at a wavelength [m]."""
@@ -136,10 +149,8 @@ def _field_pupils(telescope: Telescope, projection: Projection, wavelength: floa
 
     def light(radius: np.ndarray, directions: int) -> np.ndarray:
         """Return the light of cells of stars at radii, in each direction, [n_radius, n_direction, side, side]."""
-        angle = 2.0 * np.pi * np.arange(directions) / directions
-        x, y = (radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2).T
-        points_lit = np.zeros((len(x), len(points)))
-        points_lit[:, inside] = lit_points(telescope, field_direction(x, y, projection), wavelength, points[inside], 1)
+        points_lit = np.zeros((len(radius) * directions, len(points)))
+        points_lit[:, inside] = _lit_on_rings(telescope, projection, wavelength, radius, directions, points[inside])
         cells = points_lit.reshape(-1, _CELLS, _CELL_POINTS, _CELLS, _CELL_POINTS).mean(axis=(2, 4))
         return cells.reshape(len(radius), directions, _CELLS, _CELLS)
 
