@@ -21,6 +21,8 @@ _FAINT = 0.1
 _LEAST_NOISE = 1e-6
 # A stamp whose sum is negative has a star if the fit is above its noise by so many standard deviations.
 _SIGNIFICANT = 3.0
+# Standard deviations from the middle star's beyond which a sum is not noise alone.
+_OUTLYING = 3.0
 
 
 def star_fluxes(
@@ -42,7 +44,7 @@ def star_fluxes(
     used : array, optional
         Pixels to use, bool [n, n_pixels]; the flux is that of the whole star.
     profile : array, optional
-        Mean star of unit sum, [n_pixels]; by default :func:`median_star`.
+        Mean of these stars, of unit sum, [n_pixels]; by default :func:`median_star`.
     noise : array, optional
         Of a pixel of each star, [n]; by default :func:`pixel_noise`.
     """
@@ -59,7 +61,27 @@ def star_fluxes(
     least = np.maximum(_LEAST_NOISE * np.abs(fitted), np.finfo(float).tiny)
     reach = fitted * (_PROFILE_ERROR**2 * fitted / np.maximum(noise, least))
     flux = np.where(fitted > 0.0, np.clip(total, fitted - reach, fitted + reach), fitted)
+    flux = flux * _common_factor(total, flux, fitted, np.maximum(noise, least))
     return np.where(dark & (total <= 0.0), np.minimum(flux, 0.0), flux)
+
+
+def _common_factor(total: np.ndarray, flux: np.ndarray, fitted: np.ndarray, noise: np.ndarray) -> float:
+    """Return the factor of fluxes that the sums over the stamps, with their noise, show in common; arrays [n].
+
+    The profile of a few faint stars has its own light only as far as noise lets it: the sums of all know it better.
+    """
+    lit = (flux > 0.0) & (fitted > 0.0)
+    if not lit.any():
+        return 1.0
+    total, flux, fitted, noise = total[lit], flux[lit], fitted[lit], noise[lit]
+    ratio, error = total / flux, noise / flux
+    order = np.argsort(ratio, kind="stable")
+    weight = np.cumsum(1.0 / error[order])
+    middle = ratio[order][np.searchsorted(weight, 0.5 * weight[-1])]
+    # By fitted fluxes, whose noise is not that of the sums.
+    weight = np.where(np.abs(ratio - middle) <= _OUTLYING * error, fitted / noise**2, 0.0)
+    factor = float((weight * total).sum() / (weight * flux).sum())
+    return factor if factor > 0.0 else 1.0
 
 
 def pixel_noise(pixels: np.ndarray, used: np.ndarray | None, profile: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ import numpy as np
 
 from ...core.errors import DomainError
 from .covariance import PROCESS_COLUMNS, pair_distances, trend_variances
+from .pixel_response import shape_response, without_noise
 from .pixel_sums import log_powers_and_variances
 
 # Shape numbers to which pixels respond as to a stretch and a magnification; they come first.
@@ -171,12 +172,13 @@ def fit_pixel_fields(
     weights = 1.0 / noise
     star = mean + (weights @ deviations / weights.sum()).reshape(mean.shape)
     noise_floor = np.maximum(pixel_noise, max(_LEAST_NOISE * pixel_noise.max(), np.finfo(float).tiny))
-    relative = np.maximum(star, _FAINTEST * star.max()).ravel() / noise_floor
+    light = without_noise(star, (noise_floor / weights.sum()).reshape(star.shape))
+    relative = np.maximum(light, _FAINTEST * light.max()).ravel() / noise_floor
     relative /= relative.max()
     # What the further filters see beside the shape is as broad as they are.
     beside_shape = filters[_SHAPE_NUMBERS:] * noise_floor
     beside_shape = beside_shape - beside_shape.sum(axis=1, keepdims=True) * star.ravel()
-    response = np.concatenate([shape_response(star), beside_shape])
+    response = np.concatenate([shape_response(light), beside_shape])
     try:
         response = np.linalg.solve(response @ filters.T, response)
     except np.linalg.LinAlgError:
@@ -209,25 +211,6 @@ def fit_pixel_fields(
         residuals = fields.split(deviations)[1]
     variances = variances_of(residuals, contrasts_of(signal.covariance))
     return PixelFields(filters, fields.response, fields.profile, variances)
-
-
-def shape_response(star: np.ndarray) -> np.ndarray:
-    """Return the changes of a PSF [ny, nx] by a stretch along x, along x = y, and by magnification, [3, n_pixels].
-
-    None of them changes the sum of the pixels.
-    """
-    y, x = np.indices(star.shape) - np.array(star.shape)[:, None, None] // 2
-    along_y, along_x = _slope(star), _slope(star.T).T
-    response = -np.stack(
-        [x * along_x - y * along_y, x * along_y + y * along_x, x * along_x + y * along_y + 2.0 * star]
-    ).reshape(3, -1)
-    return np.asarray(response - response.sum(axis=1, keepdims=True) * star.ravel() / star.sum())
-
-
-def _slope(image: np.ndarray) -> np.ndarray:
-    """Return the derivative along the first axis, by differences of fourth order: stars are few pixels wide."""
-    padded = np.pad(image, ((2, 2), (0, 0)), mode="edge")
-    return np.asarray((8.0 * (padded[3:-1] - padded[1:-3]) - (padded[4:] - padded[:-4])) / 12.0)
 
 
 def krige_residuals(

@@ -41,6 +41,13 @@ def test_faint_stars_have_their_flux():
     assert abs(np.median(fluxes) - 1.0) < 0.02
 
 
+def test_fluxes_agree_in_common_with_the_sums():
+    """The median of twelve faint stars has an eighth of its light too much or too little, and fluxes had with it."""
+    for seed in range(20):
+        stars = faint_stars(12, 20.0, seed).reshape(12, -1)
+        assert abs(star_fluxes(stars).mean() / stars.sum(axis=1).mean() - 1.0) < 0.15
+
+
 def test_stars_of_negative_sum_do_not_turn_the_others():
     """Sky subtracted by 0.15 of its noise too much: more than half of the stars sum to less than nothing."""
     stars = faint_stars(60, 30.0, 6)

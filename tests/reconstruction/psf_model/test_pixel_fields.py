@@ -5,7 +5,7 @@ import pytest
 
 from pachon.core.threads import one_blas_thread
 from pachon.reconstruction.psf_model.model import PsfModel
-from pachon.reconstruction.psf_model.pixel_fields import shape_response
+from pachon.reconstruction.psf_model.pixel_response import shape_response, without_noise
 from pachon.reconstruction.psf_model.pixels import Pixels
 from pachon.reconstruction.psf_model.polynomial import design_matrix
 from pachon.reconstruction.psf_model.polynomial_fit import Polynomial
@@ -50,6 +50,32 @@ def test_the_response_is_the_change_of_an_elliptical_profile():
     for derivative, change, factor in zip(response, changes, (0.5, 0.5, 1.0), strict=True):
         np.testing.assert_allclose(factor * step * derivative, change, atol=0.05 * np.abs(change).max())
     np.testing.assert_allclose(response.sum(axis=(1, 2)), 0.0, atol=1e-14)
+
+
+def test_a_star_stands_out_of_its_noise():
+    star = psfs([0.1], [0.05], [1.5])[0]
+    np.testing.assert_allclose(without_noise(star, np.full(star.shape, 1e-24)), star, atol=1e-12)
+    noise = 0.03 * star.max()
+    stars = star + noise * np.random.default_rng(4).normal(size=(50, SIZE, SIZE))
+    y, x = np.indices(star.shape) - SIZE // 2
+    far = np.hypot(x, y) > 8.0
+    clean = np.array([without_noise(s, np.full(star.shape, noise**2)) for s in stars])
+    assert rms(clean[:, far], star[far]) < 0.25 * noise
+    assert rms(clean, star) < 0.5 * noise
+
+
+def test_pixels_of_faint_stars_on_wide_stamps_do_not_follow_noise():
+    """The response of far pixels to the shape was noise times their distance: pixels 2 to 70 times the peak."""
+    rng = np.random.default_rng(3)
+    truth = np.pad(psfs([0.0], [0.0], [1.5])[0], 14)
+    noise = np.sqrt((truth**2).sum()) / 20.0
+    worst = []
+    for count in (12, 40):
+        for _ in range(4):
+            stars = truth + noise * rng.normal(size=(count, *truth.shape))
+            model = PsfModel.fit(stars, rng.uniform(-1.0, 1.0, (count, 2)), gain=None)
+            worst.append(np.abs(model.at(rng.uniform(-0.8, 0.8, (20, 2))) - truth).max())
+    assert max(worst) < 0.5 * truth.max()
 
 
 @pytest.fixture(scope="module")
