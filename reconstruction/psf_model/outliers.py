@@ -19,6 +19,8 @@ _PSF_CHANGE = 0.04
 _FLOOR = 1e-4
 # A star's rejected pixels come back if the other stars' polynomials predict their deviations from the mean this well.
 _PREDICTED = 0.1
+# One less the leverage of a star that the others predict: as many terms as stars fit everything.
+_LEAST_ROOM = 1e-6
 
 
 @check_arguments
@@ -95,8 +97,9 @@ def restore_predicted(values: np.ndarray, mean: np.ndarray, rejected: np.ndarray
     q, _ = np.linalg.qr(terms)
     residual = values - q @ (q.T @ values)
     # The residual of a star in the fit is 1 - leverage times its distance from what the others predict.
-    distance = np.abs(residual) / np.maximum(1.0 - (q**2).sum(axis=1), 1e-6)[:, None]
-    surprising = rejected & (distance > _PREDICTED * np.abs(values - mean))
+    room = 1.0 - (q**2).sum(axis=1)[:, None]
+    predicted = np.abs(residual) <= _PREDICTED * room * np.abs(values - mean)
+    surprising = rejected & ~(predicted & (room > _LEAST_ROOM))
     return rejected & surprising.any(axis=1)[:, None]
 
 

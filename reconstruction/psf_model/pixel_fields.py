@@ -175,11 +175,13 @@ def fit_pixel_fields(
     light = without_noise(star, (noise_floor / weights.sum()).reshape(star.shape))
     relative = np.maximum(light, _FAINTEST * light.max()).ravel() / noise_floor
     relative /= relative.max()
-    # What the further filters see beside the shape is as broad as they are.
-    beside_shape = filters[_SHAPE_NUMBERS:] * noise_floor
-    beside_shape = beside_shape - beside_shape.sum(axis=1, keepdims=True) * star.ravel()
-    response = np.concatenate([shape_response(light), beside_shape])
+    response = shape_response(light)
+    shape, further = filters[:_SHAPE_NUMBERS], filters[_SHAPE_NUMBERS:]
     try:
+        # What the further filters see beside the shape is as broad as they are.
+        beside_shape = (further - (np.linalg.solve(response @ shape.T, response @ further.T)).T @ shape) * noise_floor
+        beside_shape -= beside_shape.sum(axis=1, keepdims=True) * star.ravel()
+        response = np.concatenate([response, beside_shape])
         response = np.linalg.solve(response @ filters.T, response)
     except np.linalg.LinAlgError:
         raise DomainError("stamps: expected stars; these have no light, or the same in all pixels") from None
@@ -190,9 +192,10 @@ def fit_pixel_fields(
         """Return the contrasts of the brightest stars."""
         return Contrasts.of(covariance[np.ix_(brightest, brightest)], noise[brightest])
 
-    def variances_of(residuals: np.ndarray, contrasts: Contrasts) -> np.ndarray:
+    def variances_of(residuals: np.ndarray, contrasts: Contrasts, largest: float) -> np.ndarray:
+        """Return the variances that residuals show; that of the brightest pixel is `largest` at most."""
         bright = residuals if len(brightest) == len(residuals) else residuals[brightest]
-        return relative * contrasts.scale_of(bright, relative, noise_floor)
+        return relative * min(contrasts.scale_of(bright, relative, noise_floor), largest)
 
     residuals = fields.split(deviations)[1]
     shapes = shapes[:, :_SHAPE_NUMBERS]
@@ -201,15 +204,15 @@ def fit_pixel_fields(
     # Shape numbers of smooth fields may lie near a line, across which stars show nothing: no correction is larger than
     # the response itself.
     with np.errstate(over="ignore"):  # stars without any noise have no limit
-        most = (response[:_SHAPE_NUMBERS] ** 2).max() / noise_floor
-    variances = np.minimum(variances_of(residuals, contrasts), most)
+        most = float((response[:_SHAPE_NUMBERS] ** 2).max() / noise_floor[relative.argmax()])
+    variances = variances_of(residuals, contrasts, most)
     if variances.any():
         if len(brightest) < len(noise):
             contrasts = Contrasts.of(shape_covariance, noise)
         response[:_SHAPE_NUMBERS] += fields.shapeless(variances * (shapes.T @ contrasts.dual(residuals, variances)))
         fields = PixelFields(filters, response, star.ravel(), fields.variances)
         residuals = fields.split(deviations)[1]
-    variances = variances_of(residuals, contrasts_of(signal.covariance))
+    variances = variances_of(residuals, contrasts_of(signal.covariance), np.inf)
     return PixelFields(filters, fields.response, fields.profile, variances)
 
 
