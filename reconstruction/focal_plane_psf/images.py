@@ -18,6 +18,7 @@ from ...measure.shapes import measure_shapes
 from .covariance import Covariance, Places
 from .kriging import leave_one_out, map_on_threads, neighbourhood, neighbours_of
 from .likelihood import blocks_of, fit_covariance
+from .mean_star import limited
 from .mosaic import Mosaic
 
 # The three deformations, as coefficients of kx^2, ky^2 and kx ky: along x, along x = y, and round.
@@ -28,6 +29,8 @@ _ITERATIONS = 7
 _SMALLEST = 1e-14
 # Depth of dark rings about a star, of its peak, from which on they are of no PSF.
 _RINGING = 0.1
+# Chi-square by which predictions are better than zero, at least.
+_LEAST_GAIN = 10.0
 # Pixels of zeros about a stamp while it is convolved.
 _ROOM = 8
 
@@ -116,12 +119,20 @@ class ResidualImages:
 
     @classmethod
     def fit(
-        cls, residuals: np.ndarray, places: Places, weight: np.ndarray, mosaic: Mosaic, count: int, threads: int | None
+        cls,
+        residuals: np.ndarray,
+        places: Places,
+        weight: np.ndarray,
+        mosaic: Mosaic,
+        count: int,
+        threads: int | None,
+        passed: np.ndarray | None = None,
     ) -> ResidualImages | None:
         """Fit up to `count` components of residual stamps [n, ny, nx] that predict stars left out; None without any.
 
         `weight` [n] are the inverse variances of the stars but for a factor. The noise of a pixel is that of the
         corners of the stamps: where photons of the star make more, components may be theirs, which predict nothing.
+        Components are limited to the frequencies that are `passed` (:func:`~.mean_star.mean_star`).
         """
         n, ny, nx = residuals.shape
         flat = (residuals - residuals.mean(axis=(1, 2), keepdims=True)).reshape(n, -1)
@@ -135,6 +146,9 @@ class ResidualImages:
         if keep == 0:
             return None
         rows = rows[:keep]
+        if passed is not None:
+            rows = limited(rows.reshape(keep, ny, nx), passed).reshape(keep, -1)
+            rows = np.linalg.qr(rows.T)[0].T
         signs = np.where(rows[range(keep), np.abs(rows).argmax(axis=1)] < 0, -1.0, 1.0)
         components = rows * signs[:, None]
         coefficients = np.einsum("np,kp->nk", flat, components)
@@ -174,9 +188,12 @@ class ResidualImages:
 
 
 def _predicts(covariance: Covariance, places: Places, values: np.ndarray, noise: np.ndarray) -> bool:
-    """Return whether predictions of values [n] by the other stars of their blocks are better than zero."""
+    """Return whether predictions of values [n] by the other stars of their blocks are better than zero.
+
+    By chance those of noise are, in half of all cases.
+    """
     left_out = np.empty(len(values))
     for index in blocks_of(places.xy):
         near = neighbourhood(covariance, places, values[:, None], noise[:, None], index)
         left_out[index] = leave_one_out(near)[0][:, 0]
-    return bool((left_out**2 / noise).sum() < (values**2 / noise).sum())
+    return bool((left_out**2 / noise).sum() < (values**2 / noise).sum() - _LEAST_GAIN)

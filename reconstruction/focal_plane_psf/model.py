@@ -31,6 +31,7 @@ from .file import ModelFields, model_hdus, read_model
 from .fit import SHAPES, ShapeData, Turbulence
 from .images import ResidualImages, has_shape, with_shapes
 from .layer_covariance import LayerCovariance
+from .mean_star import mean_star
 from .mosaic import Mosaic, PsfShapes
 from .optics_prior import OpticsPrior
 from .response import Instrument
@@ -362,8 +363,10 @@ class FocalPlanePsf(ModelFields, Result):
         stamps = given.stamps[self.used][finite].astype(np.float64)
         places, noise = replace(self.field.data.places[finite], amplitude=None), self.field.data.noise[finite]
         weight = 1.0 / np.maximum(noise[:, 0], np.percentile(noise[:, 0], 10))
-        mean = np.einsum("n,nyx->yx", weight / weight.sum(), stamps)
-        model = replace(self, mean_star=mean / mean.sum(), pixel_scale=given.pixel_scale)
+        mean, passed = mean_star(stamps, weight)
+        if not mean.any():
+            return self
+        model = replace(self, mean_star=mean, pixel_scale=given.pixel_scale)
         if components < 1:
             return model
         with reporter.stage("residual stamps"):
@@ -376,7 +379,7 @@ class FocalPlanePsf(ModelFields, Result):
             reached &= flux > 0.0
             residuals = stamps[reached] / flux[reached, None, None] - plain[reached]
             stars = places[reached], weight[reached]
-            pca = ResidualImages.fit(residuals, *stars, self.field.mosaic, components, threads)
+            pca = ResidualImages.fit(residuals, *stars, self.field.mosaic, components, threads, passed)
         return replace(model, pca=pca)
 
 
