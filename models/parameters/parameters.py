@@ -85,7 +85,7 @@ class Parameter:
         ConfigError
             If the text is not an address.
         DomainError
-            If a term cannot be added: a Zernike term on a surface without rims.
+            If a term cannot be added: a Zernike term on a surface without rims; or for the radius of a flat surface.
         """
         media = _media(telescope)
         bodies = (*telescope.surface_names, *telescope.groups, *media)
@@ -118,7 +118,11 @@ class Parameter:
             if surface.grating is None:
                 raise DomainError(f"parameter {text!r}: expected a surface with a grating")
             return cls(text, target, name, "grating", GROOVES[name])
-        return cls(text, target, name, "shape", term_unit(shape_with_term(surface, name), name))
+        shape = shape_with_term(surface, name)
+        if np.isinf(shape.parameters[name]):
+            curvature = f"{target}.{name.replace('radius', 'curvature')}"
+            raise DomainError(f"{text}: expected {curvature}, for {target} is flat")
+        return cls(text, target, name, "shape", term_unit(shape, name))
 
     @classmethod
     def _of_medium(cls, text: str, target: str, name: str, telescope: Telescope) -> Parameter:
