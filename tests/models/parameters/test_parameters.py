@@ -19,6 +19,7 @@ from pachon.models.shapes.freeform import Toroid
 from pachon.models.shapes.polynomial import XYPolynomial, ZernikeSag
 from pachon.models.shapes.shape import Conic, EvenAsphere, Plane
 from pachon.models.shapes.sum import Sum
+from pachon.models.surface import Interaction
 
 
 @pytest.mark.parametrize(
@@ -72,6 +73,12 @@ def test_lists(lsst_r):
         parse_parameters(["M1.Z6-4"], lsst_r)
     with pytest.raises(ConfigError, match="at least one"):
         parse_parameters([], lsst_r)
+
+
+def test_the_only_mirror_moves_and_not_a_plane_in_front_of_it(lsst_r):
+    plane = replace(lsst_r.surface("Detector"), name="Stop", interaction=Interaction.PASS)
+    single = replace(lsst_r, surfaces=(plane, lsst_r.surface("M1"), lsst_r.surface("Detector")), groups={})
+    assert [p.address for p in usual_parameters(single)] == ["M1.dx", "M1.dy", "M1.dz", "M1.rx", "M1.ry"]
 
 
 def test_usual_parameters(lsst_r):
