@@ -109,7 +109,7 @@ def throughput(
     wavelengths: ArrayLike | None = None,
     *,
     coatings: Coatings | str | os.PathLike[str] | None = None,
-    sampling: SamplingName | PupilSampling | None = None,
+    sampling: SamplingName | PupilSampling = "spiral",
     n_pupil: int | None = None,
     projection: Projection | None = None,
     threads: int | None = None,
@@ -119,7 +119,7 @@ def throughput(
     Parameters
     ----------
     telescope, fields, sampling, n_pupil, projection, threads
-        As in :meth:`pachon.Request.of`, but for a spiral of 4000 points by default.
+        As in :meth:`pachon.Request.of`, but for a spiral of 4000 points by default, beside a request too.
     wavelengths : array_like or Quantity, shape [n_wave], optional
         Vacuum wavelengths [m]; those of the telescope's file, or 21 across its band, by default.
     coatings : Coatings or path, optional
@@ -135,8 +135,8 @@ def throughput(
     DomainError
         If a table does not cover a wavelength, or the angle of a ray that is lit.
     """
-    if sampling is None and not isinstance(telescope, Request):
-        sampling, n_pupil = "spiral", _POINTS if n_pupil is None else n_pupil
+    if n_pupil is None and sampling == "spiral":
+        n_pupil = _POINTS
     request = Request.of(
         telescope,
         fields,
