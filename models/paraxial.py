@@ -32,6 +32,8 @@ _ROUNDING = 1e-12
 _LARGEST_SPHERE = 1e4
 #: Smallest radius of a reference sphere, over the diameter of the entrance pupil.
 _SMALLEST_SPHERE = 1e-2
+#: Radius of a reference sphere in units of that of the beam on the detector, at least.
+_WIDER = 2.0
 
 
 @dataclass
@@ -192,6 +194,18 @@ class StopImage:
         focal_length = -1.0 / end_slope if end_slope else math.inf
         return cls(surfaces, wavelength, object_distance, z, telecentric, scale, image, slope, focal_length)
 
+    def beam_radius(self, diameter: float) -> float:
+        """Return the paraxial radius of the light of the object on the axis at the last surface [m].
+
+        `diameter` is that of the entrance pupil [m].
+        """
+        height, slope, distance = 0.5 * diameter, 0.0, self.object_distance + self.z
+        if math.isfinite(distance) and distance:
+            slope = height / distance
+            height = slope * self.object_distance
+        heights, _ = self.surfaces.trace(height, slope, self.wavelength)
+        return abs(float(heights[-1]))
+
     def diameter(self, aperture: str, value: float) -> float:
         """Return the diameter of the entrance pupil [m] of an aperture of DesignData; 0 or infinite if it has none."""
         distance = abs(self.object_distance + self.z)
@@ -231,14 +245,18 @@ def stop_image(telescope: Telescope, *, front: bool = False, tilted: bool = Fals
     return image
 
 
-def reference_radius(pupil_distance: float, focal_length: float, pupil_diameter: float) -> float:
+def reference_radius(
+    pupil_distance: float, focal_length: float, pupil_diameter: float, beam_radius: float = 0.0
+) -> float:
     """Return the radius [m] of the reference sphere through the exit pupil.
 
-    ``pupil_distance`` is that from the exit pupil to the image [m], which may be infinite. Where the exit pupil is at
-    the image, the focal length takes its place. A sphere has at most 1e4 m.
+    ``pupil_distance`` is that from the exit pupil to the image [m], which may be infinite, ``beam_radius`` that of the
+    light of one point on the detector. Where the exit pupil is at the image, or rays of a detector far from the focus
+    would miss the sphere, the focal length takes its place. A sphere has at most 1e4 m.
     """
-    least = _SMALLEST_SPHERE * pupil_diameter
-    return next(min(abs(v), _LARGEST_SPHERE) for v in (pupil_distance, focal_length, 1.0) if abs(v) > least or v == 1.0)
+    least = max(_SMALLEST_SPHERE * pupil_diameter, _WIDER * beam_radius)
+    radius = next((abs(v) for v in (pupil_distance, focal_length) if abs(v) > least), max(1.0, least))
+    return min(radius, _LARGEST_SPHERE)
 
 
 @check_arguments

@@ -23,7 +23,7 @@ from .opd_map import OpdMap, OpdMaps
 from .opd_packets import traced_opds
 from .pupil_grid import pupil_grid
 from .pupil_sampling import CHIEF_RAY
-from .reference_sphere import path_to_plane, path_to_sphere
+from .reference_sphere import path_to_plane, path_to_sphere, require_met
 from .request import Request
 
 #: Zero of the OPD: at the chief ray, or in the mean over the lit pupil.
@@ -90,8 +90,8 @@ def wavefront_opd(
     ConfigError
         If both ``pupil`` and ``grid`` are given, or the reference or projection is unknown.
     DomainError
-        If field or wavelength lie outside what the telescope covers, silicon is transparent, or no reference point
-        exists.
+        If field or wavelength lie outside what the telescope covers, silicon is transparent, no reference point
+        exists, or rays miss the reference sphere.
     """
     request = Request.of(telescope, field, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
     focal_plane = request.on(focal_plane).focal_plane
@@ -113,6 +113,7 @@ def wavefront_opd(
             raise DomainError(f"{field_label(request.fields[0])}: no ray reaches the image")
         center = landing[lit].mean(axis=0)
     path = _reference_path(telescope, end, index, center, radius)
+    require_met(path, lit, radius)
     if silicon is not None:
         middle = (0.0, 0.0) if reference == "chief" else (x.ravel()[lit].mean(), y.ravel()[lit].mean())
         path = path - _silicon_opd(request, silicon, x - middle[0], y - middle[1]).ravel()

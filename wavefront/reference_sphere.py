@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..core.errors import DomainError
+
 
 def path_to_sphere(
     path: np.ndarray, index: float, position: np.ndarray, direction: np.ndarray, center: np.ndarray, radius: float
@@ -61,7 +63,20 @@ def sphere_distance_derivatives(
 
 
 def _root_and_projection(q: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return sqrt((q.d)^2 - q.q + R^2) and q.d [m] of positions relative to the centre of the sphere."""
+    """Return sqrt((q.d)^2 - q.q + R^2) and q.d [m] of positions relative to the centre of the sphere.
+
+    The root is NaN where a ray misses the sphere.
+    """
     along = np.einsum("...i,...i", q, direction)
     # |q| is micrometres to millimetres against metres of radius, so the root does not cancel.
-    return np.sqrt(along**2 - np.einsum("...i,...i", q, q) + radius**2), along
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(along**2 - np.einsum("...i,...i", q, q) + radius**2), along
+
+
+def require_met(path: np.ndarray, lit: np.ndarray, radius: float) -> None:
+    """Raise a DomainError where rays that are lit miss their reference sphere of a radius [m]; paths are NaN there."""
+    if not np.isfinite(path[lit]).all():
+        raise DomainError(
+            f"reference sphere of {radius:g} m: rays miss it: expected a detector nearer to the focus, or a larger "
+            "reference_sphere_radius"
+        )

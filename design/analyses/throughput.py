@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 
 #: Wavelengths across the band where none are given.
 _WAVELENGTHS = 21
+#: Points of the pupil. Rims are across the rays: 20 rings of Gauss quadrature are wrong by 0.02 of DECam's light, these
+#: by 0.001.
+_POINTS = 4000
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,7 @@ def throughput(
     wavelengths: ArrayLike | None = None,
     *,
     coatings: Coatings | str | os.PathLike[str] | None = None,
-    sampling: SamplingName | PupilSampling | None = None,
+    sampling: SamplingName | PupilSampling = "spiral",
     n_pupil: int | None = None,
     projection: Projection | None = None,
     threads: int | None = None,
@@ -116,7 +119,7 @@ def throughput(
     Parameters
     ----------
     telescope, fields, sampling, n_pupil, projection, threads
-        As in :meth:`pachon.Request.of`.
+        As in :meth:`pachon.Request.of`, but for a spiral of 4000 points by default, beside a request too.
     wavelengths : array_like or Quantity, shape [n_wave], optional
         Vacuum wavelengths [m]; those of the telescope's file, or 21 across its band, by default.
     coatings : Coatings or path, optional
@@ -132,6 +135,8 @@ def throughput(
     DomainError
         If a table does not cover a wavelength, or the angle of a ray that is lit.
     """
+    if n_pupil is None and sampling == "spiral":
+        n_pupil = _POINTS
     request = Request.of(
         telescope,
         fields,

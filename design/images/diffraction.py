@@ -129,6 +129,11 @@ def fft_psf(
     return plan.image("fft", waves, int(across), progress)
 
 
+def image_pixel(request: Request, pixels: int, reference: SpotReference) -> float:
+    """Return the pixel that images of a request have by default [m]."""
+    return _Plan(request, None, pixels, reference).pixel
+
+
 @removed_arguments(wavelength_weights=_REQUEST.format("wavelength_weights"), projection=_REQUEST.format("projection"))
 @check_arguments
 def huygens_psf(

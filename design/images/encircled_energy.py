@@ -21,7 +21,7 @@ from ...wavefront.request import Request
 from ..drawing import FEW, field_colors, finish_axes, second_scale
 from ..metrics.spots import SpotDiagram, SpotReference, light_by_distance, spots
 from ..result import FieldResult
-from .diffraction import DiffractionPsf, fft_psf
+from .diffraction import DiffractionPsf, fft_psf, image_pixel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -208,9 +208,9 @@ def diffracted_energy(
     psf = fft_psf(request, pixels=pixels, n_pupil=n_pupil, reference=reference, progress=progress)
     finer = {}
     for i in np.flatnonzero(psf.undersampled):
-        alone = fft_psf(request.at_fields(slice(i, i + 1)), pixels=pixels, n_pupil=n_pupil, reference=reference)
-        if alone.pixel < psf.pixel:
-            finer[i] = alone
+        single = request.at_fields(slice(i, i + 1))
+        if image_pixel(single, pixels, reference) < psf.pixel:
+            finer[i] = fft_psf(single, pixels=pixels, n_pupil=n_pupil, reference=reference)
     if radii is None:
         edges = {float(alone.axis[-1]) for alone in finer.values()} | {float(psf.axis[-1])}
         radii = np.unique(np.concatenate([np.linspace(0.0, edge, _RADII) for edge in edges]))

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -65,7 +66,7 @@ class Wavelets:
     lit_fraction: float  #: of the entrance pupil
     wavelength: float  #: m, in vacuum
 
-    @property
+    @cached_property
     def field(self) -> np.ndarray:
         """Complex amplitude of each wavelet at the reference point, 1/wavelength included [1/m]."""
         return self.amplitude / self.wavelength * np.exp(-2j * np.pi / self.wavelength * self.opd)

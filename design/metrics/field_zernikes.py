@@ -24,6 +24,7 @@ from ...models.zernike_polynomials import NOLL_NAMES, annular_zernikes
 from ...raytrace.rays import Projection
 from ...wavefront.pupil_optics import trace_pupils
 from ...wavefront.pupil_sampling import PupilSampling, SamplingName, gauss_annulus
+from ...wavefront.reference_sphere import require_met
 from ...wavefront.request import Request, field_points
 from ..drawing import FEW, draw_field_map, field_colors, panels_of, spread_in_field
 from ..result import FieldResult
@@ -271,6 +272,7 @@ def wavefront_zernikes(
     fitted: FittedPupil = "lit" if pupil == "lit" else "full"
     for rows, batch in request.parts():
         value, lit = _wavefronts(batch)
+        require_met(value, lit, telescope.sphere_radius)
         if pupil == "auto" and not _smooth(value, lit, batch):
             return wavefront_zernikes(request, jmax=jmax, pupil="lit", ordering=ordering)
         used = np.isfinite(value) & (lit | (fitted == "full"))

@@ -44,9 +44,9 @@ def brightest_strehl(weight: np.ndarray, pupil: np.ndarray, waves: np.ndarray) -
     Returns
     -------
     float
-        The ratio; NaN where the wavefront is too steep for so many points.
+        The ratio; NaN where the wavefront is too steep for so many points, or a ray misses the reference sphere.
     """
-    if np.ptp(waves) > _LARGEST * np.sqrt(len(waves)):
+    if not np.ptp(waves) <= _LARGEST * np.sqrt(len(waves)):
         return float("nan")
     field = weight * np.exp(2j * np.pi * waves)
     # Points at a mean distance of sqrt(pi / n) do not represent steeper tilts than half a wave over that distance; the

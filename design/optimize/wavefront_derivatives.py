@@ -16,6 +16,7 @@ from ...core.units import field_label
 from ...raytrace.adjoint.backward_pass import OutputGradient, direction_gradient, position_gradient
 from ...raytrace.adjoint.sphere_adjoint import SphereAdjoint
 from ...raytrace.rays import RayStatus
+from ...wavefront.reference_sphere import require_met
 from ...wavefront.request import Request
 from .aimed_rays import AimedRays
 from .jacobian import ParameterColumns, plane_gradient, sphere_gradient
@@ -148,6 +149,7 @@ class FieldWavefronts:
         else:
             matrix, status = self._rays.matrix(part, threads=1)
             table = self._columns.of_path(matrix)
+            require_met(table[0], status == RayStatus.OK, self._columns.telescope.reference_sphere_radius)
         lost = status > RayStatus.VIGNETTED
         if lost.any():
             table = np.where(lost, 0.0, table)

@@ -165,7 +165,7 @@ SECTIONS = (
     Section(
         "Throughput",
         "With reflections of bare glass after Fresnel; mirrors and detector are perfect here.",
-        lambda w: throughput(w.telescope, w.fields, w.wavelengths, n_pupil=6, threads=w.threads).plot(),
+        lambda w: throughput(w.telescope, w.fields, w.wavelengths, n_pupil=1000, threads=w.threads).plot(),
     ),
     Section(
         "Footprints",

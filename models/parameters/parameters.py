@@ -85,7 +85,7 @@ class Parameter:
         ConfigError
             If the text is not an address.
         DomainError
-            If a term cannot be added: a Zernike term on a surface without rims.
+            If a term cannot be added: a Zernike term on a surface without rims; or for the radius of a flat surface.
         """
         media = _media(telescope)
         bodies = (*telescope.surface_names, *telescope.groups, *media)
@@ -118,7 +118,11 @@ class Parameter:
             if surface.grating is None:
                 raise DomainError(f"parameter {text!r}: expected a surface with a grating")
             return cls(text, target, name, "grating", GROOVES[name])
-        return cls(text, target, name, "shape", term_unit(shape_with_term(surface, name), name))
+        shape = shape_with_term(surface, name)
+        if np.isinf(shape.parameters[name]):
+            curvature = f"{target}.{name.replace('radius', 'curvature')}"
+            raise DomainError(f"{text}: expected {curvature}, for {target} is flat")
+        return cls(text, target, name, "shape", term_unit(shape, name))
 
     @classmethod
     def _of_medium(cls, text: str, target: str, name: str, telescope: Telescope) -> Parameter:
@@ -216,14 +220,17 @@ def parse_parameters(texts: Iterable[str | Parameter], telescope: Telescope) -> 
 def usual_parameters(telescope: Telescope) -> tuple[Parameter, ...]:
     """Return five motions (without rotation about the axis) of every body: outermost groups and mirrors in no group.
 
-    The first mirror is left out: the others are aligned to it.
+    The first mirror is left out: the others are aligned to it. Alone it moves against the detector, as does the first
+    surface that bends the light where neither mirrors nor groups are.
     """
     groups = {name: set(members) for name, members in telescope.groups.items()}
     outer = [g for g, members in groups.items() if not any(members < larger for larger in groups.values())]
     inside = set().union(*groups.values()) if groups else set()
     mirrors = [s.name for s in telescope.surfaces if s.interaction == Interaction.MIRROR]
     bodies = [m for m in mirrors[1:] if m not in inside] + outer
-    return parse_parameters([f"{b}.{m}" for b in bodies or telescope.surface_names[:1] for m in MOTIONS[:5]], telescope)
+    bending = [s.name for s in telescope.surfaces if s.interaction in (Interaction.REFRACT, Interaction.THIN_LENS)]
+    single = (*mirrors, *bending, *telescope.surface_names)[:1]
+    return parse_parameters([f"{b}.{m}" for b in bodies or single for m in MOTIONS[:5]], telescope)
 
 
 def with_shape_terms(telescope: Telescope, parameters: Iterable[Parameter]) -> Telescope:

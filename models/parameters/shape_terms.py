@@ -22,7 +22,8 @@ def shape_with_term(surface: Surface, name: str) -> Shape:
     """Return the shape of a surface with a term such as "radius", "conic", "a6" or "Z5", which is zero if it is new.
 
     A Zernike term extends the Zernike sag of the surface; without one, it is added over the rims of the aperture, which
-    must be round. Even powers are added to a conic of revolution.
+    must be round. Even powers are added to a conic of revolution or a plane, such as the front of a Schmidt plate, also
+    below polynomials.
     """
     shape = surface.shape
     if name in shape.parameters:
@@ -39,11 +40,14 @@ def shape_with_term(surface: Surface, name: str) -> Shape:
         return _sum((*parts, ZernikeSag((0.0,) * noll_index, *_rims(surface))))
     power = re.fullmatch(r"a([468]|[1-9]\d)", name)
     if power and int(power[1]) % 2 == 0:
+        count = int(power[1]) // 2 - 1
         for i, component in enumerate(parts):
-            if isinstance(component, Rotational) and component.curvature:
-                terms = component.coefficients + (0.0,) * (int(power[1]) // 2 - 1 - len(component.coefficients))
-                asphere = EvenAsphere(1.0 / component.curvature, component.conic, terms)
+            if isinstance(component, Rotational):
+                terms = component.coefficients + (0.0,) * (count - len(component.coefficients))
+                asphere = EvenAsphere(component.radius, component.conic, terms)
                 return _sum((*parts[:i], asphere, *parts[i + 1 :]))
+        if all(isinstance(component, XYPolynomial | ZernikeSag) for component in parts):
+            return _sum((EvenAsphere(np.inf, 0.0, (0.0,) * count), *parts))
     raise unknown_name(f"shape term of {surface.name}", name, [*shape.parameters, "Z4"])
 
 

@@ -19,11 +19,13 @@ from ...models.parameters.links import followers
 from ...models.parameters.parameters import Parameter, resolved
 from ...models.parameters.tolerances import Tolerance
 from ...models.shapes.polynomial import ZernikeSag
-from ...models.surface import Interaction
+from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import noll_to_nm
 from .file import ToleranceFile, ToleranceSection
 
+#: Radii of shapes; biconics and toroids have two.
+_RADII = ("radius", "radius_x", "radius_y")
 #: Compound tolerances: two motions of one body each.
 _PAIRS = {"tilt": ("rx", "ry"), "decentre": ("dx", "dy")}
 #: Units of compound tolerances, for messages.
@@ -122,7 +124,7 @@ def _common(file: ToleranceFile, telescope: Telescope, elements: tuple[str, ...]
     for surface in acting:
         if surface.interaction == Interaction.REFRACT and surface.name not in inner:
             continue
-        plain = {k: k for k in type(file.surfaces).model_fields if k != "radius_percent" or surface.shape.curvature}
+        plain = {k: k for k in type(file.surfaces).model_fields if k != "radius_percent" or _radii(surface)}
         yield from sections(surface.name, file.surfaces, plain)
     glasses: list[str] = []
     for element in elements:
@@ -161,10 +163,8 @@ class _Maker:
             last = self._last(body)
             members = [DegreeOfFreedom(f"{body}.wedge_{m[1]}_{unit}", unit, {f"{last}.{m}": 1.0}) for m in ("rx", "ry")]
             return self._alike(section, members)
-        if kind in ("radius", "abbe") and unit == "percent":
-            address = f"{body}.{kind}"
-            percent = 0.01 * Parameter.parse(address, self.telescope).value(self.telescope)
-            return self._alike(section, [DegreeOfFreedom(section.name, "1", {address: percent})])
+        if kind in ("abbe", *_RADII) and unit == "percent":
+            return self._alike(section, [self._percentage(body, name) for name in self._percent_names(body, kind)])
         if kind == "irregularity" and unit in LENGTHS:
             return self._irregularity(section, body, unit)
         without_unit = quantity if quantity in _USUAL_UNITS else kind
@@ -172,6 +172,18 @@ class _Maker:
             expected = f"{body}.{without_unit}_{_USUAL_UNITS[without_unit]}"
             raise ConfigError(f"{section.name}: expected its unit at the end, such as {expected}")
         return self._alike(section, [self.freedom(section.name)])
+
+    def _percent_names(self, body: str, kind: str) -> tuple[str, ...]:
+        """Return the parameters of a body that a percentage is of: both radii of a biconic or a toroid."""
+        surface = {s.name: s for s in self.telescope.surfaces}.get(body)
+        if kind != "radius" or surface is None or "radius" in surface.shape.parameters:
+            return (kind,)
+        return _radii(surface) or (kind,)
+
+    def _percentage(self, body: str, name: str) -> DegreeOfFreedom:
+        address = f"{body}.{name}"
+        percent = 0.01 * Parameter.parse(address, self.telescope).value(self.telescope)
+        return DegreeOfFreedom(f"{address}_percent", "1", {address: percent})
 
     def freedom(self, name: str) -> DegreeOfFreedom:
         """Return the degree of freedom of a name: a named one, or a parameter with its unit."""
@@ -217,6 +229,12 @@ class _Maker:
             member = DegreeOfFreedom(f"{section.name} Z{j}", unit, {f"{name}.Z{j}": 1.0})
             zernike_terms[member.name] = (member, Tolerance(member.name, float(size), "normal"))
         return zernike_terms
+
+
+def _radii(surface: Surface) -> tuple[str, ...]:
+    """Return the names of the radii of a surface, those of flat sections left out."""
+    values = surface.shape.parameters
+    return tuple(name for name in _RADII if np.isfinite(values.get(name, np.inf)))
 
 
 def with_elements(telescope: Telescope) -> tuple[Telescope, tuple[str, ...]]:

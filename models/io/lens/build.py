@@ -185,7 +185,7 @@ def _pupil(lens: LensDescription, surfaces: Sequence[LensSurface]) -> _Pupil:
         text = f"{' and '.join(keywords)}: two apertures"
         lens.findings.report(further_apertures[0].source.problem(text), f"{keywords[0]} is taken")
     to_pupil = image.image_scale / image.image_slope if image.image_slope else math.inf
-    radius = reference_radius(to_pupil, image.focal_length, diameter)
+    radius = reference_radius(to_pupil, image.focal_length, diameter, image.beam_radius(diameter))
     return _Pupil(image, diameter, replace(aperture, value=value), _field_radius(lens, image), radius)
 
 

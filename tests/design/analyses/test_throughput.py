@@ -7,6 +7,7 @@ from astropy import units as u
 import pachon
 from pachon.core.errors import ConfigError, DomainError, UnknownNameError
 from pachon.design.analyses.coatings import Absorption, Coating, Coatings
+from pachon.models.aperture import Annulus
 from pachon.models.media.medium import ConstantIndex
 
 FILE = """
@@ -78,6 +79,15 @@ def test_vignetting_is_in_it(paraboloid):
     assert result.value == pytest.approx(result.lit_fraction)
     assert result.value[0, 0] == pytest.approx(0.25, abs=5e-3)
     assert result.surfaces == ()
+
+
+def test_rims_across_the_pupil_are_sampled_by_default(paraboloid):
+    # The middle of the mirror is dark to 0.3 of its radius of 0.1 m, 0.09 of the light.
+    hidden = paraboloid(2.0, 10.0, aperture=Annulus(0.03, 0.2))
+    result = pachon.design.throughput(hidden, [(0.0, 0.0)], 5e-7)
+    assert result.value[0, 0] == pytest.approx(0.91, abs=5e-4)
+    coarse = pachon.design.throughput(hidden, [(0.0, 0.0)], 5e-7, sampling="gauss")
+    assert abs(coarse.value[0, 0] - 0.91) > 5e-3
 
 
 def test_vignetting_factors_take_their_part_of_the_entrance_pupil(paraboloid):

@@ -8,6 +8,7 @@ from scipy.integrate import cumulative_simpson
 from scipy.special import j0, j1
 
 import pachon
+import pachon.design.images.encircled_energy as module
 from pachon.core.errors import ConfigError, DomainError
 from pachon.design.images.diffraction import fft_psf
 from pachon.design.images.encircled_energy import encircled_energy, energy_curve
@@ -166,3 +167,14 @@ def test_widths_of_images_narrower_than_their_pixels_are_not_known(paraboloid):
     assert np.isnan(psf.fwhm[0])
     assert psf.summary()["fwhm_um"] == [None]
     assert "within some pixels" in psf.plot().axes[0].get_xlabel()
+
+
+def test_no_image_is_made_twice_for_large_spots(paraboloid, monkeypatch):
+    # 4 mm off the focus the spot of f/20 is far larger than an Airy disc, and its pixels are as fine as they get.
+    telescope = paraboloid(shift=4e-3)
+    made = []
+    monkeypatch.setattr(module, "fft_psf", lambda *a, **k: made.append(a) or fft_psf(*a, **k))
+    energy = module.diffracted_energy(pachon.Request.of(telescope, [(0.0, 0.0)], WAVE), pixels=32)
+    assert len(made) == 1
+    # A disc of light of 0.2 mm: 80 % within sqrt(0.8) of its radius, but for its rings of diffraction.
+    assert energy.radius_holding(0.8)[0] == pytest.approx(np.sqrt(0.8) * 1e-4, rel=0.05)

@@ -1,5 +1,7 @@
 """Addresses of parameters, what they do, and the motions that belong to them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,8 +17,9 @@ from pachon.models.parameters.parameters import (
 from pachon.models.parameters.shape_terms import term_polynomial, term_unit
 from pachon.models.shapes.freeform import Toroid
 from pachon.models.shapes.polynomial import XYPolynomial, ZernikeSag
-from pachon.models.shapes.shape import Conic, EvenAsphere
+from pachon.models.shapes.shape import Conic, EvenAsphere, Plane
 from pachon.models.shapes.sum import Sum
+from pachon.models.surface import Interaction
 
 
 @pytest.mark.parametrize(
@@ -70,6 +73,12 @@ def test_lists(lsst_r):
         parse_parameters(["M1.Z6-4"], lsst_r)
     with pytest.raises(ConfigError, match="at least one"):
         parse_parameters([], lsst_r)
+
+
+def test_the_only_mirror_moves_and_not_a_plane_in_front_of_it(lsst_r):
+    plane = replace(lsst_r.surface("Detector"), name="Stop", interaction=Interaction.PASS)
+    single = replace(lsst_r, surfaces=(plane, lsst_r.surface("M1"), lsst_r.surface("Detector")), groups={})
+    assert [p.address for p in usual_parameters(single)] == ["M1.dx", "M1.dy", "M1.dz", "M1.rx", "M1.ry"]
 
 
 def test_usual_parameters(lsst_r):
@@ -185,3 +194,23 @@ def test_new_terms_change_no_sag(lsst_r):
     x = np.linspace(-0.7, 0.7, 9)
     for name in ("M1", "L1_exit"):
         assert np.array_equal(present.surface(name).shape.sag(x, 0.1), lsst_r.surface(name).shape.sag(x, 0.1))
+
+
+FLAT_PLATE = EvenAsphere(np.inf, 0.0, (1e-3,))
+POWER = XYPolynomial(((2, 0, 2e-3), (0, 2, 2e-3)))
+
+
+@pytest.mark.parametrize("shape", [Plane(), FLAT_PLATE, POWER, Sum((FLAT_PLATE, POWER)), ZernikeSag((0.0, 1e-6), 1.0)])
+def test_powers_are_added_to_flat_plates(lsst_r, shape):
+    plates = tuple(replace(s, shape=shape) if s.name == "L1_exit" else s for s in lsst_r.surfaces)
+    plate = replace(lsst_r, surfaces=plates)
+    changed = apply(plate, {Parameter.parse("L1_exit.a6", plate): 0.5})
+    x, y = np.array([0.1, -0.3]), np.array([0.2, 0.4])
+    added = changed.surface("L1_exit").shape.sag(x, y) - shape.sag(x, y)
+    assert added == pytest.approx(0.5 * np.hypot(x, y) ** 6, abs=1e-17)
+
+
+def test_a_flat_surface_has_no_radius_to_change(lsst_r):
+    plates = tuple(replace(s, shape=FLAT_PLATE) if s.name == "L1_exit" else s for s in lsst_r.surfaces)
+    with pytest.raises(DomainError, match=r"^L1_exit.radius: expected L1_exit.curvature, for L1_exit is flat$"):
+        Parameter.parse("L1_exit.radius", replace(lsst_r, surfaces=plates))

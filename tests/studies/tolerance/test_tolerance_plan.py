@@ -9,6 +9,10 @@ import pytest
 import pachon
 from pachon.core.errors import ConfigError, DomainError, PachonError, UnknownNameError
 from pachon.models.media.medium import abbe_number
+from pachon.models.shapes.freeform import Biconic, Toroid
+from pachon.models.shapes.polynomial import XYPolynomial
+from pachon.models.shapes.shape import EvenAsphere
+from pachon.models.shapes.sum import Sum
 from pachon.studies.tolerance.file import ToleranceFile, load_tolerances
 from pachon.studies.tolerance.plan import tolerance_plan, with_elements
 
@@ -63,6 +67,19 @@ def test_tolerances_of_all_surfaces_elements_and_gaps(triplet):
     assert {n for n in names if n.endswith((".n", "abbe_percent"))} == {
         f"S{i}.{what}" for i in (1, 3, 6) for what in ("n", "abbe_percent")
     }
+
+
+def test_percentages_of_radii_that_are_two_or_none(triplet):
+    plate = Sum((EvenAsphere(np.inf, 0.0, (1.0,)), XYPolynomial(((2, 0, 1.0), (0, 2, 1.0)))))
+    shapes = {"S1": Toroid(0.02, np.inf, 0.0, ()), "S2": Biconic(0.05, -0.04, 0.0, -1.0), "S3": plate}
+    surfaces = tuple(replace(s, shape=shapes.get(s.name, s.shape)) for s in triplet.surfaces)
+    plan = plan_of(replace(triplet, surfaces=surfaces), surfaces={"radius_percent": 1})
+    names = [t.name for t in plan.tolerances]
+    assert names[:4] == ["S1.radius_x_percent", "S2.radius_x_percent", "S2.radius_y_percent", "S4.radius_percent"]
+    changed = moved(plan, S2_radius_y_percent=2.0).surface("S2").shape
+    assert (changed.radius_x, changed.radius_y) == (0.05, pytest.approx(-0.0408))
+    with pytest.raises(DomainError, match=r"S3.radius: expected S3.curvature, for S3 is flat"):
+        plan_of(plan.telescope, tolerances=[{"name": "S3.radius_percent", "size": 1}])
 
 
 def test_what_the_numbers_mean(triplet):
