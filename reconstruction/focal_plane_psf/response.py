@@ -57,8 +57,8 @@ _NODES = 5
 _WAVEFRONT_STEP = 0.05e-6
 # ... and of the logarithm of the Fried parameter.
 _SEEING_STEP = 0.05
-# Rays of a star that tell the lit part of its pupil within some per cent.
-_LIT_RAYS = 100
+# Rays of a star that tell the lit part of its pupil to three thousandths (100: to a hundredth).
+_LIT_RAYS = 400
 # Stars at which derivatives are computed.
 _SAMPLES = 300
 # ... fewer where they are costly.
