@@ -1,6 +1,7 @@
 """PSF models of stars from other programs: what is kept, how well held-out stars are predicted, and the command."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -190,6 +191,23 @@ def test_the_command_leaves_model_picture_and_table(stars, tmp_path, monkeypatch
     table = Table.read("stars_psf.ecsv")
     assert len(table) == COUNT
     assert np.isnan(table["held_out_e1"][5])
+
+
+def test_undersampled_stars_have_no_adaptive_moments(tmp_path, monkeypatch, capsys):
+    """As of HSM, whose matrix becomes singular: the table of the command ended in a TypeError."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(3)
+    positions, centres = rng.uniform(0.0, 1000.0, (12, 2)), rng.uniform(-0.2, 0.2, (12, 2, 1, 1))
+    y, x = np.indices((21, 21)) - 10
+    light = (
+        4e4 / (2.0 * np.pi * 0.45**2) * np.exp(-0.5 * ((x - centres[:, 0]) ** 2 + (y - centres[:, 1]) ** 2) / 0.45**2)
+    )
+    stamps = light + rng.normal(size=light.shape) * np.sqrt(25.0 + light)
+    Table({"x": positions[:, 0], "y": positions[:, 1], "stamp": stamps}).write("stars.fits")
+    assert main(["model", "stars.fits", "--no-picture", "--interpolation", "polynomial", "--order", "0"]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"rms of g, weighted e of the stars +-, \d+\.\d\d %", out)
+    assert re.search(r"rms dT/T, held out +-\s", out)
 
 
 def test_stars_that_sextractor_flags_are_left_out(stars, tmp_path, monkeypatch, capsys):
