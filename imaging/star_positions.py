@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from astropy import units as u
 from astropy.io import fits
-from astropy.table import Table
+from astropy.table import Table, vstack
 
 from ..core.errors import DomainError, ProductError, error_context
 from ..core.files import parsing, read_bytes
@@ -27,6 +28,7 @@ _CELESTIAL = (
 )  # fmt: skip
 #: Columns of LSST's tables of sources, in radian where they have no unit.
 _CELESTIAL_RADIAN = ("coord_ra", "coord_dec")
+_PIXELS, _SKY = (*_FROM_ONE, *_FROM_ZERO), (*_CELESTIAL, _CELESTIAL_RADIAN)
 
 
 def read_star_positions(path: Path, image: CcdImage) -> np.ndarray:
@@ -62,7 +64,7 @@ def positions_in(table: Table, image: CcdImage, path: Path) -> np.ndarray:
         for names in pairs:
             if set(names) <= columns.keys():
                 return values(names) - first
-    for names in (*_CELESTIAL, _CELESTIAL_RADIAN):
+    for names in _SKY:
         if not set(names) <= columns.keys():
             continue
         if not image.has_sky:
@@ -75,7 +77,11 @@ def positions_in(table: Table, image: CcdImage, path: Path) -> np.ndarray:
 
 
 def table_in(path: Path) -> Table:
-    """Read a table; of a FITS file the first one with a position, as LDAC files have others before it."""
+    """Read a table; of a FITS file the one with positions, as LDAC files have others before it.
+
+    Of several, such as of SExtractor for the CCDs of an exposure, the rows of all are returned, without pixels: which
+    image these are of is unknown. ProductError where they have no celestial positions.
+    """
     data = read_bytes(path, ProductError)
     with warnings.catch_warnings(), parsing(path, "no table of stars in FITS, ECSV or CSV", ProductError):
         warnings.simplefilter("ignore")
@@ -83,7 +89,25 @@ def table_in(path: Path) -> Table:
             return text_table(data)
         with open_fits(path, ProductError, content=data, lazy_load_hdus=False) as hdus:
             tables = [Table.read(hdu) for hdu in hdus if isinstance(hdu, (fits.BinTableHDU, fits.TableHDU))]
-    known_names = {name for names in (*_FROM_ONE, *_FROM_ZERO, *_CELESTIAL, _CELESTIAL_RADIAN) for name in names}
     if not tables:
         raise ProductError("has no table of stars", file=path)
-    return next((t for t in tables if known_names & {name.lower() for name in t.colnames}), tables[0])
+    with_positions = [t for t in tables if _known_names(t, (*_PIXELS, *_SKY))]
+    if len(with_positions) < 2:
+        return with_positions[0] if with_positions else tables[0]
+    if not all(_known_names(t, _SKY) for t in with_positions):
+        raise ProductError(
+            f"has {len(with_positions)} tables with pixels of images: expected one, or columns "
+            f"{' and '.join(_CELESTIAL[0])}",
+            file=path,
+        )
+    for table in with_positions:
+        table.remove_columns(_known_names(table, _PIXELS))
+        table.meta.clear()
+    with parsing(path, "tables of different columns", ProductError):
+        return vstack(with_positions)
+
+
+def _known_names(table: Table, pairs: Iterable[tuple[str, str]]) -> list[str]:
+    """Return the columns of a table that are among pairs of names in small letters."""
+    names = {name for pair in pairs for name in pair}
+    return [name for name in table.colnames if name.lower() in names]

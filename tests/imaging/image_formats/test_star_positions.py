@@ -65,3 +65,26 @@ def test_columns_that_are_no_positions(image, tmp_path, table, text):
     Table(table).write(tmp_path / "stars.ecsv")
     with pytest.raises(PachonError, match=text):
         read_star_positions(tmp_path / "stars.ecsv", image)
+
+
+def test_a_catalogue_of_several_ccds(image, tmp_path):
+    """As SExtractor writes for an exposure; the pixels of its first CCD were taken for those of every image."""
+    sky = image.celestial(PIXELS)
+    columns = {
+        "X_IMAGE": [5.0, 6.0, 7.0],
+        "Y_IMAGE": [5.0, 6.0, 7.0],
+        "ALPHA_J2000": sky[:, 0],
+        "DELTA_J2000": sky[:, 1],
+    }
+    ccds = [fits.table_to_hdu(Table(columns)[rows]) for rows in (slice(2), slice(2, 3))]
+    path = tmp_path / "ccds.cat"
+    fits.HDUList([fits.PrimaryHDU(), *ccds]).writeto(path)
+    np.testing.assert_allclose(read_star_positions(path, image), PIXELS, atol=1e-6)
+    for ccd in ccds:
+        ccd.columns.del_col("ALPHA_J2000")
+        ccd.columns.del_col("DELTA_J2000")
+    fits.HDUList([fits.PrimaryHDU(), *ccds]).writeto(path, overwrite=True)
+    with pytest.raises(
+        PachonError, match=r"ccds\.cat: has 2 tables with pixels of images: expected one, or columns ra"
+    ):
+        read_star_positions(path, image)
