@@ -1,9 +1,11 @@
 """Images of other programs measured: shapes and fluxes against the truth, few stars, stars and PSFs of one's own."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
+import drawn_fields
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -72,6 +74,15 @@ def test_galaxies_of_a_plain_image_have_their_shapes_and_fluxes(catalogue, field
     np.testing.assert_allclose(table["g2_sky"][good], table["e2"][good], atol=2e-3)
     assert catalogue.warnings == ()
     assert len(catalogue.stars) >= 25
+
+
+def test_stars_too_sharp_for_the_pixels_are_told(tmp_path, monkeypatch):
+    """Errors of ellipticities were two to nine times those given at a FWHM of 1.8 to 1.5 pixels, without a word."""
+    monkeypatch.setattr(drawn_fields, "PSF", (0.5, 0.0, 0.5))
+    catalogue = pachon.measure_image(loaded(draw_field(15, 5, side=200), tmp_path), threads=1)
+    (warning,) = catalogue.warnings
+    assert re.match(r"its stars have a FWHM of 1\.[5-9]\d* pixels: below 2 ", warning)
+    assert catalogue.metrics()["warnings"] == [warning]
 
 
 @pytest.mark.slow
