@@ -28,7 +28,10 @@ _CELESTIAL = (
 )  # fmt: skip
 #: Columns of LSST's tables of sources, in radian where they have no unit.
 _CELESTIAL_RADIAN = ("coord_ra", "coord_dec")
-_PIXELS, _SKY = (*_FROM_ONE, *_FROM_ZERO), (*_CELESTIAL, _CELESTIAL_RADIAN)
+#: Columns of pixels.
+_PIXELS = (*_FROM_ONE, *_FROM_ZERO)
+#: Columns of places on the sky.
+_SKY = (*_CELESTIAL, _CELESTIAL_RADIAN)
 
 
 def read_star_positions(path: Path, image: CcdImage) -> np.ndarray:

@@ -23,9 +23,11 @@ from .fits_parts import FitsPart, FitsParts, beside
 _DES_SATURATED = 2
 #: Bit of the haloes of bright stars there, which marks an area.
 _DES_STAR = 32
-#: Bits of JWST's planes DQ: DO_NOT_USE and SATURATED. Others, such as JUMP_DET of a cosmic ray taken out of a ramp, say
-#: what was corrected, and are set in most cores of bright stars.
-_JWST_BAD, _JWST_SATURATED = 1, 2
+#: Bit DO_NOT_USE of JWST's planes DQ. Others, such as JUMP_DET of a cosmic ray taken out of a ramp, say what was
+#: corrected, and are set in most cores of bright stars.
+_JWST_BAD = 1
+#: Bit SATURATED there.
+_JWST_SATURATED = 2
 
 #: Ends of the names of Euclid's extensions: the pixels, their rms, their flags.
 _EUCLID_IMAGE, _EUCLID_RMS, _EUCLID_FLAGS = ".SCI", ".RMS", ".FLG"
