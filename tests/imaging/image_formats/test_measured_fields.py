@@ -76,6 +76,16 @@ def test_galaxies_of_a_plain_image_have_their_shapes_and_fluxes(catalogue, field
     assert len(catalogue.stars) >= 25
 
 
+def test_why_no_object_may_be_a_star(field, tmp_path):
+    """Of an image with scattered bad pixels the message was that of 0 objects the smallest are of different sizes."""
+    pixels = field.image.copy()
+    pixels[np.random.default_rng(1).random(pixels.shape) < 0.03] = np.nan
+    fits.PrimaryHDU(pixels, header_of()).writeto(tmp_path / "a.fits")
+    text = r"no stars: 0 of \d+ objects may be stars, expected at least 3 \(left out: .*\d+ saturated, .* masked pixels"
+    with pytest.raises(DomainError, match=text):
+        pachon.measure_image(pachon.load_image(tmp_path / "a.fits"), threads=1)
+
+
 def test_stars_too_sharp_for_the_pixels_are_told(tmp_path, monkeypatch):
     """Errors of ellipticities were two to nine times those given at a FWHM of 1.8 to 1.5 pixels, without a word."""
     monkeypatch.setattr(drawn_fields, "PSF", (0.5, 0.0, 0.5))
