@@ -44,7 +44,8 @@ def dithered(values: np.ndarray, unfit: NDArray[np.bool_]) -> Dithered:
     unfit : array of bool
         Those that do not count, of the same shape.
     """
-    step = _step_of(values[~unfit])
+    every = values.size // _MOST_VALUES | 1  # odd: columns of an image are an even number
+    step = _step_of(values.ravel()[::every][~unfit.ravel()[::every]])
     if not step:
         return Dithered(values, 0.0)
     fraction = np.arange(values.size) * _GOLDEN_RATIO % 1.0 - 0.5
@@ -53,8 +54,7 @@ def dithered(values: np.ndarray, unfit: NDArray[np.bool_]) -> Dithered:
 
 def _step_of(values: np.ndarray) -> float:
     """Return the step of values [n] that are whole multiples of it, but for an offset; 0 of others."""
-    every = -(-len(values) // _MOST_VALUES) or 1
-    rising = np.sort(values[::every])
+    rising = np.sort(values)
     tail = int(_TAIL * len(rising))
     rising = rising[tail : len(rising) - tail]
     levels = rising[np.append(True, np.diff(rising) > 0.0)[: len(rising)]]

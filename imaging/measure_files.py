@@ -32,8 +32,9 @@ from .star_positions import read_star_positions
 
 #: What names of products add to that of an image.
 CATALOGUE_SUFFIX, PSF_SUFFIX, PICTURE_SUFFIX = "_galaxies", "_psf", "_measured"
-#: Memory that measuring an image takes, in sizes of its pixels, variance and mask: 1.3 GiB for 4096 x 4096 pixels.
-_PIXEL_SIZES = 8
+#: Memory that measuring an image takes, in sizes of its pixels, variance and mask: 1.7 GiB for 4096 x 4096 pixels and
+#: 20 000 objects.
+_PIXEL_SIZES = 11
 
 
 class MeasuredFiles(NamedTuple):
