@@ -159,7 +159,7 @@ def fill_by_median_star(
         filled, x, y = images.copy(), earlier.x.copy(), earlier.y.copy()
         usable, star = earlier.usable.copy(), earlier.median_star
         if not star.any():
-            star = _median_star(images, bad, x, y, sigma)
+            star = _median_star(images[usable], bad[usable], x[usable], y[usable], sigma)
         filled[masked] = fill_by_profiles(images[masked], bad[masked], star, x[masked], y[masked], sigma)[0]
     moving = masked
     places_before, steps_before = np.full((2, len(images), 2), np.nan)

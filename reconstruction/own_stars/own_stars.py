@@ -279,11 +279,13 @@ class _CentredStars:
 
         `sigma` is that of the weight of the moments.
         """
-        good = self.images[self.flags == 0]
-        with_defects = (self.flags != 0) & ((self.flags & ~_MASKABLE) == 0)
-        if not len(good) or not with_defects.any():
+        good = self.flags == 0
+        with_defects = ~good & ((self.flags & ~_MASKABLE) == 0)
+        if not with_defects.any():
             return np.zeros(len(self.flags), dtype=bool)
-        star = median_star(good.reshape(len(good), -1)).reshape(good.shape[1:])
+        # Where hardly any star is without a neighbour, those of the others are at many places, and no part of a median.
+        compared = self.images[good if good.sum() >= FEWEST_STARS else good | with_defects]
+        star = median_star(compared.reshape(len(compared), -1)).reshape(compared.shape[1:])
         return with_defects & apart_from_core(defects, star, sigma)
 
     def usable_ones(self, usable: np.ndarray) -> _CentredStars:

@@ -194,6 +194,22 @@ def test_the_command_leaves_model_picture_and_table(stars, tmp_path, monkeypatch
     assert np.isnan(table["held_out_e1"][5])
 
 
+@pytest.mark.parametrize("empty", [(), (3,)])
+def test_stars_that_all_have_neighbours_are_masked(stars, empty):
+    """Of a crowded field none was left; with one star without a neighbour all were used. A lost stamp has no place."""
+    rng = np.random.default_rng(5)
+    stamps = stars.stamps[10:30] - 300.0
+    for stamp, (row, column) in zip(stamps, rng.choice([-10, 10], (20, 2)), strict=True):
+        stamp += 0.5 * np.roll(stamp, (row, column), axis=(0, 1))
+    stamps[list(empty)] = rng.normal(0.0, SKY, (len(empty), SIZE, SIZE))
+    own = fit_own_stars(stamps, stars.positions[10:30], PIXEL, interpolation="polynomial", order=0)
+    assert (own.flags[own.used] & StarFlag.NEIGHBOUR).all()
+    assert own.used.sum() >= 18
+    alone = fit_own_stars(stars.stamps[10:30], stars.positions[10:30], PIXEL, interpolation="polynomial", order=0)
+    sizes = [pachon.adaptive_moments(fit.model.at([[2e3, 2e3]]), PIXEL).T[0] for fit in (own, alone)]
+    assert sizes[0] == pytest.approx(sizes[1], rel=5e-3)
+
+
 @pytest.mark.parametrize("level", [300.3, 300.45])
 def test_stamps_of_whole_numbers(stars, level):
     """As cameras write them: medians of whole numbers as sky made models 1 % too large, and S/N 15 % wrong."""
