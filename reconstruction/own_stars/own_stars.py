@@ -235,6 +235,7 @@ def fit_own_stars(
     stars = stars.usable_ones(shapes.usable)
     _require_used(stars, min_snr, gain)
     used = stars.used
+    _require_places_apart(places[used])
     used_indices = np.flatnonzero(used)
     parts = np.array_split(
         stream(require_seed(seed), "held-out stars").permutation(len(used_indices)), min(FOLDS, len(used_indices))
@@ -305,6 +306,18 @@ def _require_used(stars: _CentredStars, min_snr: float, gain: float) -> None:
             f"gain = {gain:g}"
         )
     require_stars(stars.used, np.where(stars.used, 0, stars.flags), FEWEST_STARS, reason)
+
+
+def _require_places_apart(places: np.ndarray) -> None:
+    """Raise DomainError where stars have one place [n, 2]: their doubles would predict those that are held out."""
+    first = np.unique(places, axis=0, return_index=True)[1]
+    doubles = np.setdiff1d(np.arange(len(places)), first)
+    if len(doubles) and len(first) > 1:
+        x, y = places[doubles[0]]
+        raise DomainError(
+            f"positions: {len(doubles)} of {counted(len(places), 'star')} stand there twice, such as that at "
+            f"({x:g}, {y:g}): expected each once"
+        )
 
 
 def _flux_and_snr(stamps: np.ndarray, rms: np.ndarray, gain: float) -> tuple[np.ndarray, np.ndarray]:

@@ -194,6 +194,14 @@ def test_the_command_leaves_model_picture_and_table(stars, tmp_path, monkeypatch
     assert np.isnan(table["held_out_e1"][5])
 
 
+@pytest.mark.parametrize("options", [{}, {"interpolation": "polynomial", "order": 0}])
+def test_stars_listed_twice_are_refused(stars, options):
+    """The message counted among those used; polynomials took them, and predicted each star from its double."""
+    rows = np.append(np.arange(30), [7, 12])
+    with pytest.raises(DomainError, match=r"positions: 2 of 31 stars stand there twice, such as that at \(\d+\.?\d*, "):
+        fit_own_stars(stars.stamps[rows], stars.positions[rows], PIXEL, **options)
+
+
 @pytest.mark.parametrize("empty", [(), (3,)])
 def test_stars_that_all_have_neighbours_are_masked(stars, empty):
     """Of a crowded field none was left; with one star without a neighbour all were used. A lost stamp has no place."""
