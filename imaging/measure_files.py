@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from astropy.io import fits
 
 from ..core.errors import ConfigError, DomainError, ProductError
+from ..core.file_names import file_name
 from ..core.files import content_hash, write_bytes
 from ..core.long_work import Execution
 from ..core.memory import require_bytes
@@ -167,7 +168,7 @@ class FileMeasurement:
 
     def product(self, source: ImageSource, suffix: str) -> Path:
         """Return the path of a product of an image."""
-        extension = "" if source.extension is None else f"_{source.extension}"
+        extension = "" if source.extension is None else f"_{file_name(source.extension)}"
         folder = source.path.parent if self.folder is None else self.folder
         return folder / f"{image_stem(source.path)}{extension}{suffix}.fits"
 

@@ -16,8 +16,10 @@ from scipy import ndimage
 import pachon
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, PachonError, ProductError
+from pachon.imaging.image_formats.load import ImageSource
 from pachon.imaging.image_psf import psfs_on
 from pachon.imaging.image_stars import detected_objects, few_or_many_stars
+from pachon.imaging.measure_files import FileMeasurement, MeasureOptions, images_among
 from pachon.imaging.star_positions import table_in
 from pachon.measure.catalogue.matching import match_positions
 
@@ -74,6 +76,14 @@ def test_galaxies_of_a_plain_image_have_their_shapes_and_fluxes(catalogue, field
     np.testing.assert_allclose(table["g2_sky"][good], table["e2"][good], atol=2e-3)
     assert catalogue.warnings == ()
     assert len(catalogue.stars) >= 25
+
+
+@pytest.mark.parametrize("extension", ["CCD 1/2", "../../x", "DET1.CHIP1"])
+def test_products_stay_beside_their_image_whatever_its_extension_is_called(tmp_path, extension):
+    """The slash of an extension was that of a folder: the command ended after the image was measured."""
+    product = FileMeasurement(None, MeasureOptions()).product(ImageSource(tmp_path / "a.fits", extension), "_psf")
+    assert product.parent == tmp_path
+    assert images_among([tmp_path / "a.fits", product]) == [tmp_path / "a.fits"]
 
 
 def test_why_no_object_may_be_a_star(field, tmp_path):
