@@ -25,6 +25,7 @@ from ..reconstruction.psf_model.model import PsfModel
 from ..reconstruction.psf_model.recipe import DEFAULT, Recipe
 from .image_file import CcdImage
 from .image_formats.load import ImageSettings, ImageSource, image_sources, image_stem, load_image
+from .image_formats.pixel_noise import BlankImageError
 from .image_psf import ImagePsf, load_image_psf
 from .measure import measure_image
 from .measure_picture import measured_png
@@ -140,8 +141,8 @@ class FileMeasurement:
         psf = (
             None if options.psf is None else _model_in(Path(options.psf), content_hash(Path(options.psf), ProductError))
         )
-        image = load_image(source.path, extension=source.extension, settings=options.settings)
         try:
+            image = load_image(source.path, extension=source.extension, settings=options.settings)
             stars = None if options.stars is None else read_star_positions(Path(options.stars), image)
             catalogue = measure_image(
                 image,
@@ -152,7 +153,7 @@ class FileMeasurement:
                 min_snr=options.min_snr,
                 threads=threads,
             )
-        except DomainError as error:
+        except (DomainError, BlankImageError) as error:
             return str(error)
         table, metrics = catalogue.table(), catalogue.metrics()
         table.meta |= {"MEASHASH": self.digest(source), "METRICS": json.dumps(metrics)}
@@ -236,8 +237,8 @@ def measure_files(
 ) -> MeasuredFiles:
     """Measure the images of files, and write a catalogue and a PSF model of each.
 
-    Images without objects, or with too few stars, are reported and left out. Products have the same bytes on any number
-    of threads and by any workers.
+    Images without objects or noise, or with too few stars, are reported and left out. Products have the same bytes on
+    any number of threads and by any workers.
 
     Parameters
     ----------

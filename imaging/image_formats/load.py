@@ -22,6 +22,7 @@ from ..image_file import CcdImage
 from .fits_parts import FitsPart, FitsParts
 from .header_cards import BAND_KEYS, CHIP_KEYS, GAIN_KEYS, HeaderCards, Sourced
 from .pixel_noise import (
+    BlankImageError,
     PixelVariance,
     Sky,
     measured_variance,
@@ -227,7 +228,7 @@ def _image_of(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -> C
     if plane is not None:
         bad |= plane.without
     if (bad | defects.saturated).all():
-        raise ProductError("all pixels are masked, saturated or not finite: expected some that are good", file=path)
+        raise BlankImageError("all pixels are masked, saturated or not finite: expected some that are good", file=path)
     sky = Sky.of(image, bad | defects.saturated, path)
     light = np.where(bad, 0.0, image - sky.level)
     gain = Sourced(settings.gain, "settings") if settings.gain is not None else cards.gain()
@@ -288,7 +289,7 @@ def _noise_plane(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -
     _require_shape(noise_file, part, planes.image)
     variance = variance_of_plane(noise_file.pixels(part), kind, f"{noise_file.path.name} {part.name}".strip())
     if variance.without.all():
-        raise ProductError(f"{part.name or 'image'}: no pixel has a {kind.value} above zero", file=noise_file.path)
+        raise BlankImageError(f"{part.name or 'image'}: no pixel has a {kind.value} above zero", file=noise_file.path)
     return variance
 
 

@@ -43,6 +43,10 @@ _BLUR = 1.0
 _RELATIVE = 2.0
 
 
+class BlankImageError(ProductError):
+    """No pixel of an image is good, or none has noise: that of a CCD which is out of order."""
+
+
 @dataclass(frozen=True, eq=False)
 class Sky:
     """Sky of an image: level [ny, nx] and rms noise [ny, nx] of pixels without objects."""
@@ -52,7 +56,7 @@ class Sky:
 
     @classmethod
     def of(cls, image: np.ndarray, bad: np.ndarray, path: Path) -> Sky:
-        """Measure the sky in cells; ProductError where no noise is left."""
+        """Measure the sky in cells; BlankImageError where no noise is left."""
         pixels = dithered(np.where(bad, 0.0, image), bad)
         data = np.ascontiguousarray(pixels.values, dtype=np.float64)
         background = sep.Background(data, mask=bad, bw=_CELL, bh=_CELL)
@@ -63,7 +67,7 @@ class Sky:
             background = sep.Background(data, mask=objects | bad, bw=_CELL, bh=_CELL)
         rms = pixels.noise(background.rms())
         if not (np.isfinite(rms).all() and (rms > 0.0).all()):
-            raise ProductError("its pixels have no noise: expected an image with a sky, or its variance", file=path)
+            raise BlankImageError("its pixels have no noise: expected an image with a sky, or its variance", file=path)
         return cls(background.back(), rms)
 
 

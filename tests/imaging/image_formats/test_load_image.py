@@ -397,6 +397,7 @@ def changed(**cards):
         (changed(MAGZERO="unknown"), {}, r"a\.fits: MAGZERO = 'unknown': expected a finite number"),
         (changed(CRVAL1="NaN"), {}, r"a\.fits: CRVAL1 = 'NaN': expected a finite number"),
         (changed(CD1_1=0.0, CD2_1=0.0), {}, r"a\.fits: CD1_1, .*: expected a matrix with an inverse"),
+        (changed(CD1_1=0.0, CD2_2=0.0), {}, r"a\.fits: CD1_1, .*: expected a matrix with an inverse"),
         (changed(CTYPE1="RA---XYZ", CTYPE2="DEC--XYZ"), {}, r"a\.fits: CTYPE1 = RA---XYZ: expected world"),
         (changed(CTYPE1="LINEAR", CTYPE2="LINEAR"), {}, r"a\.fits: no world coordinates \(CTYPE1 = 'LINEAR'"),
         # astropy takes ecliptic coordinates for those of ICRS, and has no frame for other systems.

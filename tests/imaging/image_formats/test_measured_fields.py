@@ -16,10 +16,11 @@ from scipy import ndimage
 import pachon
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, PachonError, ProductError
+from pachon.core.long_work import Execution
 from pachon.imaging.image_formats.load import ImageSource
 from pachon.imaging.image_psf import psfs_on
 from pachon.imaging.image_stars import detected_objects, few_or_many_stars
-from pachon.imaging.measure_files import FileMeasurement, MeasureOptions, images_among
+from pachon.imaging.measure_files import FileMeasurement, MeasureOptions, images_among, measure_files
 from pachon.imaging.star_positions import table_in
 from pachon.measure.catalogue.matching import match_positions
 
@@ -315,6 +316,18 @@ def test_a_psf_model_of_piff_takes_colours(image):
     np.testing.assert_allclose(drawn, direct / direct.sum(axis=(1, 2), keepdims=True), rtol=1e-12)
     with pytest.raises(DomainError, match="properties: expected values of"):
         psfs_on(image, model, places, 1, np.nan)
+
+
+def test_ccds_that_are_out_of_order_are_left_out(tmp_path):
+    """DECam has two: the command ended at the first of them, and --resume as well."""
+    field = draw_field(12, 3, side=160)
+    dead = [np.zeros_like(field.image), np.full_like(field.image, np.nan)]
+    ccds = [fits.ImageHDU(pixels, header_of(), name=f"N{i}") for i, pixels in enumerate([*dead, field.image])]
+    fits.HDUList([fits.PrimaryHDU(), *ccds]).writeto(tmp_path / "a.fits")
+    measured = measure_files([tmp_path / "a.fits"], execution=Execution(threads=1))
+    assert list(measured.metrics) == ["a.fits[N2]"]
+    assert "its pixels have no noise" in measured.left_out["a.fits[N0]"]
+    assert "all pixels are masked" in measured.left_out["a.fits[N1]"]
 
 
 @pytest.mark.slow
