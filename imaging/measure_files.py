@@ -92,11 +92,11 @@ class MeasureOptions:
             settings=settings,
         )
 
-    def object_colours(self, image: CcdImage) -> ObjectColours | None:
-        """Return the colours of the objects of an image; None where no table has them."""
+    def object_colours(self, image: CcdImage, among: int) -> ObjectColours | None:
+        """Return the colours of the objects of an image among those of its file; None where no table has them."""
         if self.colours is None or self.colour_column is None:
             return None
-        return read_object_colours(Path(self.colours), self.colour_column, image)
+        return read_object_colours(Path(self.colours), self.colour_column, image, among)
 
     def keys(self) -> dict[str, Any]:
         """Return all that decides the products of an image, files by their content."""
@@ -143,13 +143,13 @@ class FileMeasurement:
         )
         try:
             image = load_image(source.path, extension=source.extension, settings=options.settings)
-            stars = None if options.stars is None else read_star_positions(Path(options.stars), image)
+            stars = None if options.stars is None else read_star_positions(Path(options.stars), image, source.among)
             catalogue = measure_image(
                 image,
                 psf=psf,
                 recipe=options.recipe,
                 stars=stars,
-                colours=options.object_colours(image),
+                colours=options.object_colours(image, source.among),
                 min_snr=options.min_snr,
                 threads=threads,
             )

@@ -34,18 +34,18 @@ _PIXELS = (*_FROM_ONE, *_FROM_ZERO)
 _SKY = (*_CELESTIAL, _CELESTIAL_RADIAN)
 
 
-def read_star_positions(path: Path, image: CcdImage) -> np.ndarray:
+def read_star_positions(path: Path, image: CcdImage, among: int = 1) -> np.ndarray:
     """Return the pixels of an image, the first one's centre at (0, 0), at which a catalogue has stars, [k, 2].
 
     Raises
     ------
     ProductError
-        If the file is no table (FITS, ECSV or CSV), or has no positions; or celestial ones of an image without world
-        coordinates.
+        If the file is no table (FITS, ECSV or CSV), or has no positions; celestial ones of an image without world
+        coordinates; or pixels alone, and the image is one `among` several of a file.
     DomainError
         If no star of it lies on the image.
     """
-    positions = positions_in(table_in(path), image, path)
+    positions = positions_in(table_in(path), image, path, among)
     ny, nx = image.image.shape
     inside = np.isfinite(positions).all(axis=1)
     inside[inside] = ((positions[inside] >= -0.5) & (positions[inside] <= np.array([nx, ny]) - 0.5)).all(axis=1)
@@ -54,8 +54,11 @@ def read_star_positions(path: Path, image: CcdImage) -> np.ndarray:
     return positions[inside]
 
 
-def positions_in(table: Table, image: CcdImage, path: Path) -> np.ndarray:
-    """Return the pixels of an image at which the rows of a table of a file are, [n, 2]; ProductError without any."""
+def positions_in(table: Table, image: CcdImage, path: Path, among: int = 1) -> np.ndarray:
+    """Return the pixels of an image at which the rows of a table of a file are, [n, 2]; ProductError without any.
+
+    Pixels do not count for an image `among` several of a file: they are those of one of them.
+    """
     with error_context(file=path):
         columns = names_in_small_letters(table.colnames)
 
@@ -65,7 +68,7 @@ def positions_in(table: Table, image: CcdImage, path: Path) -> np.ndarray:
 
     for pairs, first in ((_FROM_ONE, 1.0), (_FROM_ZERO, 0.0)):
         for names in pairs:
-            if set(names) <= columns.keys():
+            if among == 1 and set(names) <= columns.keys():
                 return values(names) - first
     for names in _SKY:
         if not set(names) <= columns.keys():
@@ -75,6 +78,12 @@ def positions_in(table: Table, image: CcdImage, path: Path) -> np.ndarray:
                 f"has {' and '.join(names)}, the image no world coordinates: expected x and y", file=path
             )
         return image.pixels_at(np.rad2deg(values(names, u.rad if names == _CELESTIAL_RADIAN else u.deg)))
+    if among > 1 and _known_names(table, _PIXELS):
+        raise ProductError(
+            f"has pixels of one of {among} images: expected columns {' and '.join(_CELESTIAL[0])}, or one image, by "
+            "its extension",
+            file=path,
+        )
     expected = ", ".join(" and ".join(names) for names in (*_FROM_ZERO[:1], *_FROM_ONE[:1], *_CELESTIAL[:2]))
     raise ProductError(f"has no positions of stars: expected columns {expected}", file=path)
 

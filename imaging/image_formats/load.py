@@ -106,11 +106,14 @@ class ImageSource:
         Name or number of the extension in a file of several images; None for the only one.
     n_bytes : int
         Size of its pixels, variance and mask in memory [byte].
+    among : int
+        Number of images of the file that are read, this one included.
     """
 
     path: Path
     extension: str | None = None
     n_bytes: int = field(default=0, compare=False)
+    among: int = field(default=1, compare=False)
 
 
 def image_sources(path: Path, extension: str | None = None) -> list[ImageSource]:
@@ -123,6 +126,7 @@ def image_sources(path: Path, extension: str | None = None) -> list[ImageSource]
             path,
             file.label(planes.image) if several else None,
             _PLANE_BYTES * int(np.prod(planes.image.image_shape)),
+            len(images),
         )
         for planes in images
     ]

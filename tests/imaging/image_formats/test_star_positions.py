@@ -88,3 +88,15 @@ def test_a_catalogue_of_several_ccds(image, tmp_path):
         PachonError, match=r"ccds\.cat: has 2 tables with pixels of images: expected one, or columns ra"
     ):
         read_star_positions(path, image)
+
+
+def test_pixels_are_of_one_of_several_images(image, tmp_path):
+    """They were taken for those of every CCD of a file, also beside places on the sky."""
+    (x, y), (ra, dec) = PIXELS.T, image.celestial(PIXELS).T
+    path = tmp_path / "stars.csv"
+    Table({"x": x + 20.0, "y": y, "ra": ra, "dec": dec}).write(path)
+    np.testing.assert_allclose(read_star_positions(path, image, 2), PIXELS, atol=1e-6)
+    np.testing.assert_array_equal(read_star_positions(path, image), PIXELS + np.array([20.0, 0.0]))
+    Table({"x": x, "y": y}).write(path, overwrite=True)
+    with pytest.raises(PachonError, match=r"stars\.csv: has pixels of one of 2 images: expected columns ra and"):
+        read_star_positions(path, image, 2)
