@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, PachonError
 from ..core.number_text import counted
-from ..core.statistics import RMS_PER_MAD
+from ..core.statistics import RMS_PER_MAD, finite_row_medians
 from ..core.units import ARCSEC, positive_angle
+from ..measure.catalogue.cutouts import cut_out
 from ..measure.catalogue.detect import detect_objects
 from ..measure.catalogue.few_stars import FEWEST_STARS, LEAST_FWHM, named_stars, smallest_stars
 from ..measure.catalogue.objects import DetectedObjects
@@ -135,8 +136,15 @@ def _usual_radius(objects: DetectedObjects, min_snr: float) -> float:
 
 def _single_stars(image: CcdImage, stars: StarSelection) -> StarSelection:
     """Return the selected stars whose stamps show no neighbour, cosmic ray or saturated core."""
-    noise = float(np.sqrt(sky_variance(image)))
-    return stars.without(flag_stars(stars.stamps, noise, gain=image.gain).flags != 0)
+    return stars.without(flag_stars(stars.stamps, _noise_about(image, stars), gain=image.gain).flags != 0)
+
+
+def _noise_about(image: CcdImage, stars: StarSelection) -> np.ndarray:
+    """Return the rms noise of a pixel without objects about each star [k]: stacks are not equally deep everywhere."""
+    variance = np.where((image.mask == 0) & (image.variance > 0.0), image.variance, np.nan)
+    stamps = cut_out(variance, *stars.positions.T, stars.stamps.shape[1], np.nan)
+    medians = finite_row_medians(stamps.reshape(len(stamps), -1))
+    return np.sqrt(np.where(np.isfinite(medians), medians, sky_variance(image)))
 
 
 def sky_variance(image: CcdImage) -> float:

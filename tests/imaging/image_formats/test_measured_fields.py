@@ -318,6 +318,21 @@ def test_a_psf_model_of_piff_takes_colours(image):
         psfs_on(image, model, places, 1, np.nan)
 
 
+def test_stars_on_the_shallow_part_of_a_stack(field, tmp_path):
+    """The noise of the deeper half of the pixels made defects of theirs: of 7 none was left."""
+    shallow = np.arange(len(field.image)) < 150
+    variance = np.where(shallow, 9.0, 1.0) * field.variance
+    noise = np.random.default_rng(2).normal(size=variance.shape) * np.sqrt(variance - field.variance)
+    planes = fits.PrimaryHDU(field.image + noise, header_of()), fits.ImageHDU(variance, name="VARIANCE")
+    fits.HDUList(list(planes)).writeto(tmp_path / "a.fits")
+    image = pachon.load_image(tmp_path / "a.fits")
+    stars = few_or_many_stars(image, detected_objects(image), 30.0)
+    inner = (np.abs(field.places[field.star] - 0.5 * len(field.image)) < 140.0).all(axis=1)
+    expected = (field.places[field.star, 0] < 145.0) & inner
+    assert expected.sum() > 5
+    assert (stars.positions[:, 0] < 145.0).sum() >= expected.sum() - 1
+
+
 def test_ccds_that_are_out_of_order_are_left_out(tmp_path):
     """DECam has two: the command ended at the first of them, and --resume as well."""
     field = draw_field(12, 3, side=160)
