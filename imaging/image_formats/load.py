@@ -44,6 +44,8 @@ _KEPT = ("OBJECT", "TELESCOP", "INSTRUME", "DATE-OBS", "MJD-OBS", "CCDNUM")
 _SOFTENING = "BSOFTEN"
 #: Bytes of a pixel, its variance and its mask.
 _PLANE_BYTES = 10
+#: Least noise of a pixel: below it variances are zero, or in coarse steps, in single precision.
+_LEAST_NOISE = 1e-21
 #: Fewest pixels along a side of an image: the stamps of stars have as many.
 _LEAST_SIDE = 32
 
@@ -234,6 +236,13 @@ def _image_of(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -> C
     if (bad | defects.saturated).all():
         raise BlankImageError("all pixels are masked, saturated or not finite: expected some that are good", file=path)
     sky = Sky.of(image, bad | defects.saturated, path)
+    noise = float(np.median(sky.rms))
+    if noise < _LEAST_NOISE:
+        raise ProductError(
+            f"noise of {noise:.2g} in a pixel: expected {_LEAST_NOISE:g} or more, in a larger unit, for squares in "
+            "single precision",
+            file=path,
+        )
     light = np.where(bad, 0.0, image - sky.level)
     gain = Sourced(settings.gain, "settings") if settings.gain is not None else cards.gain()
     variance, gain = _variance(plane, sky, light, bad | defects.saturated, gain)

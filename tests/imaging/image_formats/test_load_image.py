@@ -140,6 +140,13 @@ def test_an_image_of_lsst_has_the_gain_of_its_variance(field, tmp_path):
     assert (image.zero_point, image.band, image.header["EXPTIME"]) == (31.4, "i2", 30.0)
 
 
+def test_units_in_which_variances_are_no_numbers(field, tmp_path):
+    """As of erg/s/cm^2/Hz: no objects were detected."""
+    path = write(tmp_path / "a.fits", fits.PrimaryHDU(1e-24 * field.image.astype(float), header_of(GAIN=1e24)))
+    with pytest.raises(ProductError, match=r"a\.fits: noise of 1\.\de-23 in a pixel: expected 1e-21 or more"):
+        pachon.load_image(path)
+
+
 def test_whole_numbers_have_the_sky_of_the_light(field, tmp_path):
     """Cameras write them: the mode by a median of whole numbers was 0.9 off, fluxes 20 % at a noise of 1.5."""
     light = (field.image / 9.0).astype(np.float32)
