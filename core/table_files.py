@@ -28,6 +28,8 @@ FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits", ".parque
 ENDINGS = (*FORMATS, ".fit")
 # Of columns in CSV files; the first where a file has one column.
 _DELIMITERS = ",;\t"
+# First line of a catalogue of SExtractor: number, name and meaning of its first column.
+_SEXTRACTOR = re.compile(r"#\s+1\s+[A-Z]")
 # Headings such as "rms [nm]".
 _HEADING = re.compile(r"(.*?)\s*\[([^][]+)\](.*)")
 #: Values, unit in FITS notation and description.
@@ -155,9 +157,12 @@ def text_table(data: bytes, kind: str = "ascii.csv") -> Table:
     """Return the table of a file of CSV or ECSV; numbers that a CSV file leaves out are masked.
 
     CSV files are also those of spreadsheets, with a byte order mark, comments, semicolons or tabs for commas. A column
-    ``x [mm]`` of theirs has a copy ``x`` with the unit, unless there is one.
+    ``x [mm]`` of theirs has a copy ``x`` with the unit, unless there is one. Catalogues of SExtractor (ASCII_HEAD) have
+    a line for each column before the rows.
     """
     lines = text_lines(data.decode("utf-8-sig"))
+    if lines and _SEXTRACTOR.match(lines[0]):
+        return Table.read(lines, format="ascii.sextractor")
     if kind == "ascii.ecsv" or (lines and lines[0].startswith("# %ECSV")):
         return Table.read(lines, format="ascii.ecsv")
     head = next((line for line in lines if line.strip() and not line.startswith("#")), None)

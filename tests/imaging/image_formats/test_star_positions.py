@@ -90,6 +90,27 @@ def test_a_catalogue_of_several_ccds(image, tmp_path):
         read_star_positions(path, image)
 
 
+def test_a_catalogue_of_sextractor_in_ascii(image, tmp_path):
+    """Its default, ASCII_HEAD, was said to have no positions."""
+    head = (
+        "#   1 NUMBER                 Running object number\n"
+        "#   2 X_IMAGE                Object position along x                                    [pixel]\n"
+        "#   3 Y_IMAGE                Object position along y                                    [pixel]\n"
+        "#   4 ALPHA_J2000            Right ascension of barycenter (J2000)                      [deg]\n"
+        "#   5 DELTA_J2000            Declination of barycenter (J2000)                          [deg]\n"
+        "#   6 FLAGS                  Extraction flags\n"
+    )
+    sky = image.celestial(PIXELS)
+    rows = [
+        f"{i + 1:10d} {x + 1:10.4f} {y + 1:10.4f} {ra:11.7f} {dec:+11.7f} 0"
+        for i, ((x, y), (ra, dec)) in enumerate(zip(PIXELS, sky, strict=True))
+    ]
+    path = tmp_path / "stars.cat"
+    path.write_text(head + "\n".join(rows) + "\n")
+    np.testing.assert_allclose(read_star_positions(path, image), PIXELS, atol=1e-9)
+    np.testing.assert_allclose(read_star_positions(path, image, 2), PIXELS, atol=2e-3)
+
+
 def test_pixels_are_of_one_of_several_images(image, tmp_path):
     """They were taken for those of every CCD of a file, also beside places on the sky."""
     (x, y), (ra, dec) = PIXELS.T, image.celestial(PIXELS).T
