@@ -17,7 +17,7 @@ from astropy.table import Column, MaskedColumn, Table
 from astropy.table.meta import get_header_from_yaml
 from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
-from .errors import ConfigError, PachonError, ProductError, error_context
+from .errors import ConfigError, DomainError, PachonError, ProductError, error_context, shown
 from .files import parsing, read_bytes, text_lines, write_bytes
 from .products import Card, Columns, card_text, card_value
 from .units import metres, pure_numbers, radians
@@ -110,6 +110,9 @@ def column_in_unit(columns: Mapping[str, Any] | Table, name: str, unit: u.UnitBa
     column = columns[name]
     if column.ndim != 1:
         raise ProductError(f"column {name!r}: expected one number in every row")
+    if column.dtype.kind in "US" and len(column):  # such as right ascensions in hours, minutes and seconds
+        text, unit_text = shown(str(column[0])), "" if unit is None else f" in {unit}"
+        raise DomainError(f"column {name} = {text}, ...: expected real numbers{unit_text}")
     numbers = pure_numbers(column.data if isinstance(column, Column) else column, f"column {name}")
     if unit is None:
         return numbers
