@@ -142,7 +142,8 @@ def _single_stars(image: CcdImage, stars: StarSelection) -> StarSelection:
 def _noise_about(image: CcdImage, stars: StarSelection) -> np.ndarray:
     """Return the rms noise of a pixel without objects about each star [k]: stacks are not equally deep everywhere."""
     variance = np.where((image.mask == 0) & (image.variance > 0.0), image.variance, np.nan)
-    stamps = cut_out(variance, *stars.positions.T, stars.stamps.shape[1], np.nan)
+    x, y = stars.positions.T
+    stamps = cut_out(variance, x, y, stars.stamps.shape[1], np.nan)
     medians = finite_row_medians(stamps.reshape(len(stamps), -1))
     return np.sqrt(np.where(np.isfinite(medians), medians, sky_variance(image)))
 
