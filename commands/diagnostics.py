@@ -149,7 +149,8 @@ def _compare(
     with interruptible(quiet) as reporter, reporter.stage(f"PSF of {stars.name}"):
         with warnings_shown(WcsWarning):
             psf = load_piff(piff)
-        piff_comparison = compare_with_piff(psf, *load_stars(stars, **columns), **options)
+        cutouts = load_stars(stars, **columns)
+        piff_comparison = compare_with_piff(psf, *cutouts.part(cutouts.unflagged()), **options)
         piff_comparison.write_folder(folder)
     return piff_comparison, folder
 

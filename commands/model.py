@@ -33,7 +33,7 @@ from .options import (
     picture_kind,
     recipe_of_options,
 )
-from .tables import Rows, print_json
+from .tables import Rows, number_texts, numbers_of, print_json
 from .verdicts import model_verdict
 
 if TYPE_CHECKING:
@@ -146,6 +146,7 @@ def model_command(
     if as_json:
         print_json({"model": str(path), **summary_of_stars})
     elif not quiet:
+        summary_of_stars = numbers_of(summary_of_stars)
         flagged = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in summary_of_stars["flagged"].items() if n)
         percent = partial(_percent, summary_of_stars)
         rows = [
@@ -172,8 +173,9 @@ def model_command(
 
 
 def _percent(figures: dict[str, Any], *keys: str) -> str:
-    """Return some figures in per cent."""
-    return ", ".join(f"{100 * figures[key]:.2f} %" for key in keys)
+    """Return figures in per cent, dashes for unknown ones: stars may be too sharp for adaptive moments."""
+    texts = number_texts((100.0 * figures[key] for key in keys), ".2f")
+    return ", ".join(text if text == "-" else f"{text} %" for text in texts)
 
 
 def _flags_text(flags: np.ndarray) -> str:

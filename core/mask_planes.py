@@ -12,10 +12,12 @@ from .errors import ProductError, shown
 
 #: Planes of pixels of a star that is too bright.
 TOO_BRIGHT = frozenset({"SAT", "SATUR", "SATURATED", "SUSPECT"})
-#: Planes of LSST and HSC that mark an area, an object or what has been corrected: such a pixel is as good as any.
+#: Planes of LSST and HSC that mark an area, an object or what has been corrected: such a pixel is as good as any. On
+#: stacks CLIPPED, REJECTED and SENSOR_EDGE mark pixels that an image is left out of; INEXACT_PSF is all three.
 HARMLESS = frozenset(
     {
         "BRIGHT_OBJECT",
+        "CLIPPED",
         "CROSSTALK",
         "DETECTED",
         "DETECTED_NEGATIVE",
@@ -27,6 +29,7 @@ HARMLESS = frozenset(
         "INJECTED_TEMPLATE",
         "NOT_DEBLENDED",
         "PARTLY_VIGNETTED",
+        "REJECTED",
         "SENSOR_EDGE",
     }
 )

@@ -17,7 +17,7 @@ from astropy.table import Column, MaskedColumn, Table
 from astropy.table.meta import get_header_from_yaml
 from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
-from .errors import ConfigError, PachonError, ProductError, error_context
+from .errors import ConfigError, DomainError, PachonError, ProductError, error_context, shown
 from .files import parsing, read_bytes, text_lines, write_bytes
 from .products import Card, Columns, card_text, card_value
 from .units import metres, pure_numbers, radians
@@ -28,6 +28,8 @@ FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits", ".parque
 ENDINGS = (*FORMATS, ".fit")
 # Of columns in CSV files; the first where a file has one column.
 _DELIMITERS = ",;\t"
+# First line of a catalogue of SExtractor: number, name and meaning of its first column.
+_SEXTRACTOR = re.compile(r"#\s+1\s+[A-Z]")
 # Headings such as "rms [nm]".
 _HEADING = re.compile(r"(.*?)\s*\[([^][]+)\](.*)")
 #: Values, unit in FITS notation and description.
@@ -108,6 +110,9 @@ def column_in_unit(columns: Mapping[str, Any] | Table, name: str, unit: u.UnitBa
     column = columns[name]
     if column.ndim != 1:
         raise ProductError(f"column {name!r}: expected one number in every row")
+    if column.dtype.kind in "US" and len(column):  # such as right ascensions in hours, minutes and seconds
+        text, unit_text = shown(str(column[0])), "" if unit is None else f" in {unit}"
+        raise DomainError(f"column {name} = {text}, ...: expected real numbers{unit_text}")
     numbers = pure_numbers(column.data if isinstance(column, Column) else column, f"column {name}")
     if unit is None:
         return numbers
@@ -155,9 +160,12 @@ def text_table(data: bytes, kind: str = "ascii.csv") -> Table:
     """Return the table of a file of CSV or ECSV; numbers that a CSV file leaves out are masked.
 
     CSV files are also those of spreadsheets, with a byte order mark, comments, semicolons or tabs for commas. A column
-    ``x [mm]`` of theirs has a copy ``x`` with the unit, unless there is one.
+    ``x [mm]`` of theirs has a copy ``x`` with the unit, unless there is one. Catalogues of SExtractor (ASCII_HEAD) have
+    a line for each column before the rows.
     """
     lines = text_lines(data.decode("utf-8-sig"))
+    if lines and _SEXTRACTOR.match(lines[0]):
+        return Table.read(lines, format="ascii.sextractor")
     if kind == "ascii.ecsv" or (lines and lines[0].startswith("# %ECSV")):
         return Table.read(lines, format="ascii.ecsv")
     head = next((line for line in lines if line.strip() and not line.startswith("#")), None)

@@ -33,7 +33,14 @@ from ..sky.sky_shapes import STEP, SkyShapes, along_sky, jacobians_on_sky
 from .image_file import CcdImage
 from .image_psf import ImagePsf, psfs_on
 from .image_shear import object_shears
-from .image_stars import MANY_STARS, detected_objects, few_or_many_stars, few_stars_warning, fit_image_psf
+from .image_stars import (
+    MANY_STARS,
+    detected_objects,
+    few_or_many_stars,
+    few_stars_warning,
+    fit_image_psf,
+    undersampled_warning,
+)
 from .object_colours import ObjectColours
 
 if TYPE_CHECKING:
@@ -280,6 +287,8 @@ def measure_image(
         model = fit_image_psf(image, selected_stars, None if recipe is None else Recipe.of(recipe), star_colours)
         if len(selected_stars) < MANY_STARS:
             warnings = (few_stars_warning(selected_stars),)
+        if (warning := undersampled_warning(objects, selected_stars)) is not None:
+            warnings = (*warnings, warning)
     else:
         model = psf
         selected_stars = _stars_beside_model(image, objects, psf, min_snr, stars, colours)

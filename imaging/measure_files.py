@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from astropy.io import fits
 
 from ..core.errors import ConfigError, DomainError, ProductError
+from ..core.file_names import file_name
 from ..core.files import content_hash, write_bytes
 from ..core.long_work import Execution
 from ..core.memory import require_bytes
@@ -24,6 +25,7 @@ from ..reconstruction.psf_model.model import PsfModel
 from ..reconstruction.psf_model.recipe import DEFAULT, Recipe
 from .image_file import CcdImage
 from .image_formats.load import ImageSettings, ImageSource, image_sources, image_stem, load_image
+from .image_formats.pixel_noise import BlankImageError
 from .image_psf import ImagePsf, load_image_psf
 from .measure import measure_image
 from .measure_picture import measured_png
@@ -32,8 +34,9 @@ from .star_positions import read_star_positions
 
 #: What names of products add to that of an image.
 CATALOGUE_SUFFIX, PSF_SUFFIX, PICTURE_SUFFIX = "_galaxies", "_psf", "_measured"
-#: Memory that measuring an image takes, in sizes of its pixels, variance and mask: 1.3 GiB for 4096 x 4096 pixels.
-_PIXEL_SIZES = 8
+#: Memory that measuring an image takes, in sizes of its pixels, variance and mask: 1.7 GiB for 4096 x 4096 pixels and
+#: 20 000 objects.
+_PIXEL_SIZES = 11
 
 
 class MeasuredFiles(NamedTuple):
@@ -89,11 +92,11 @@ class MeasureOptions:
             settings=settings,
         )
 
-    def object_colours(self, image: CcdImage) -> ObjectColours | None:
-        """Return the colours of the objects of an image; None where no table has them."""
+    def object_colours(self, image: CcdImage, among: int) -> ObjectColours | None:
+        """Return the colours of the objects of an image among those of its file; None where no table has them."""
         if self.colours is None or self.colour_column is None:
             return None
-        return read_object_colours(Path(self.colours), self.colour_column, image)
+        return read_object_colours(Path(self.colours), self.colour_column, image, among)
 
     def keys(self) -> dict[str, Any]:
         """Return all that decides the products of an image, files by their content."""
@@ -138,19 +141,19 @@ class FileMeasurement:
         psf = (
             None if options.psf is None else _model_in(Path(options.psf), content_hash(Path(options.psf), ProductError))
         )
-        image = load_image(source.path, extension=source.extension, settings=options.settings)
         try:
-            stars = None if options.stars is None else read_star_positions(Path(options.stars), image)
+            image = load_image(source.path, extension=source.extension, settings=options.settings)
+            stars = None if options.stars is None else read_star_positions(Path(options.stars), image, source.among)
             catalogue = measure_image(
                 image,
                 psf=psf,
                 recipe=options.recipe,
                 stars=stars,
-                colours=options.object_colours(image),
+                colours=options.object_colours(image, source.among),
                 min_snr=options.min_snr,
                 threads=threads,
             )
-        except DomainError as error:
+        except (DomainError, BlankImageError) as error:
             return str(error)
         table, metrics = catalogue.table(), catalogue.metrics()
         table.meta |= {"MEASHASH": self.digest(source), "METRICS": json.dumps(metrics)}
@@ -166,7 +169,7 @@ class FileMeasurement:
 
     def product(self, source: ImageSource, suffix: str) -> Path:
         """Return the path of a product of an image."""
-        extension = "" if source.extension is None else f"_{source.extension}"
+        extension = "" if source.extension is None else f"_{file_name(source.extension)}"
         folder = source.path.parent if self.folder is None else self.folder
         return folder / f"{image_stem(source.path)}{extension}{suffix}.fits"
 
@@ -234,8 +237,8 @@ def measure_files(
 ) -> MeasuredFiles:
     """Measure the images of files, and write a catalogue and a PSF model of each.
 
-    Images without objects, or with too few stars, are reported and left out. Products have the same bytes on any number
-    of threads and by any workers.
+    Images without objects or noise, or with too few stars, are reported and left out. Products have the same bytes on
+    any number of threads and by any workers.
 
     Parameters
     ----------

@@ -63,7 +63,7 @@ class ObjectColours:
         return np.where(distance <= MATCH, self.values[known][nearest], np.nan)
 
 
-def read_object_colours(path: Path, column: str, image: CcdImage) -> ObjectColours:
+def read_object_colours(path: Path, column: str, image: CcdImage, among: int = 1) -> ObjectColours:
     """Read the colours of objects from a column of a table with pixels or celestial coordinates.
 
     Temperatures (columns teff and the like) become g - i of blackbodies (:func:`~.star_spectrum.psf_colours`).
@@ -71,8 +71,8 @@ def read_object_colours(path: Path, column: str, image: CcdImage) -> ObjectColou
     Raises
     ------
     ProductError
-        If the file is no table (FITS, ECSV or CSV), has no positions, or no such column of numbers; or celestial
-        positions, and the image no world coordinates.
+        If the file is no table (FITS, ECSV or CSV), has no positions, or no such column of numbers; celestial
+        positions, and the image no world coordinates; or pixels alone, and the image is one `among` several of a file.
     """
     table = table_in(path)
     with error_context(file=path):
@@ -84,4 +84,4 @@ def read_object_colours(path: Path, column: str, image: CcdImage) -> ObjectColou
     if values.dtype.kind not in "fiu" or values.ndim != 1:
         raise ProductError(f"column {column!r} has type {values.dtype}: expected a number in every row", file=path)
     colours = np.ma.filled(values.astype(float), np.nan)
-    return ObjectColours(positions_in(table, image, path), psf_colours(colours, column))
+    return ObjectColours(positions_in(table, image, path, among), psf_colours(colours, column))

@@ -323,12 +323,26 @@ def _moments(ellipses: np.ndarray, flags: np.ndarray, covariance: np.ndarray, sc
     )
 
 
+def _gaussian_moments(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray) -> np.ndarray:
+    """Return the moments of Gaussians of unit sum and covariances [n] up to fourth order, [n, power of y, power of x].
+
+    Those of a higher total order are zero here.
+    """
+    moments = np.zeros((len(xx), _POWERS, _POWERS))
+    moments[:, 0, 0] = 1.0
+    moments[:, 0, 2], moments[:, 1, 1], moments[:, 2, 0] = xx, xy, yy
+    moments[:, 0, 4], moments[:, 4, 0] = 3.0 * xx**2, 3.0 * yy**2
+    moments[:, 1, 3], moments[:, 3, 1] = 3.0 * xx * xy, 3.0 * xy * yy
+    moments[:, 2, 2] = xx * yy + 2.0 * xy**2
+    return moments
+
+
 def _covariance(pixels: np.ndarray, counted: np.ndarray, variance: np.ndarray, ellipses: np.ndarray) -> np.ndarray:
     """Return the covariance [n, 6, 6] of ln flux, x, y, Mxx, Mxy, Myy [pixel] from the variance of the pixels.
 
-    The fit solves F_k = sum(G (I - a G) phi_k) = 0 over the pixels that count, phi_k being 1, x, y, x^2, x y, y^2.
-    Noise n changes F_k by sum(G n phi_k), and the parameters by -J^-1 dF, J being the derivatives of F. NaN where the
-    pixels do not determine them.
+    The fit solves F_k = sum(G (I - a G) phi_k) = 0 over the pixels that count, phi_k being 1, x, y, x^2, x y, y^2. As
+    in HSM the sums of G^2 go on beyond the stamp. Noise n changes F_k by sum(G n phi_k), and the parameters by
+    -J^-1 dF, J being the derivatives of F. NaN where the pixels do not determine them.
     """
     count, ny, nx = pixels.shape
     x0, y0, xx, xy, yy = (ellipses[:, i, None, None] for i in range(5))
@@ -340,9 +354,12 @@ def _covariance(pixels: np.ndarray, counted: np.ndarray, variance: np.ndarray, e
     g = np.where(rho2 < float(LARGEST_RHO2), np.exp(-0.5 * rho2), 0.0)
     x_powers, y_powers = (np.stack([z**k for k in range(_POWERS)], axis=1) for z in (x[:, 0], y[:, :, 0]))
     with one_blas_thread():
-        light, square, noise = (
-            y_powers @ f @ x_powers.transpose(0, 2, 1) for f in (g * pixels, g**2 * counted, g**2 * variance)
+        light, hidden, noise = (
+            y_powers @ f @ x_powers.transpose(0, 2, 1) for f in (g * pixels, g**2 * ~counted, g**2 * variance)
         )  # [n, power of y, power of x]
+    shape = np.stack([[xx[:, 0, 0], xy[:, 0, 0]], [xy[:, 0, 0], yy[:, 0, 0]]]).transpose(2, 0, 1) / unit**2
+    p, q, r = shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]
+    square = np.pi * unit**2 * _gaussian_moments(0.5 * p, 0.5 * q, 0.5 * r) - hidden
     at = (slice(None), _Y_POWER[:, None] + _Y_POWER, _X_POWER[:, None] + _X_POWER)
     peak = light[:, 0, 0] / square[:, 0, 0]
     jacobian = _DERIVATIVE * (light[at] - 2.0 * peak[:, None, None] * square[at])
@@ -354,8 +371,6 @@ def _covariance(pixels: np.ndarray, counted: np.ndarray, variance: np.ndarray, e
     of_equations = np.ascontiguousarray(noise[at] / light[:, :1, :1] ** 2)
     covariance = inverse @ of_equations @ inverse.transpose(0, 2, 1)
     # From M^-1 dx and M^-1 dM M^-1, in units of `unit`, to dx and dM; from ln a to the logarithm of the flux a |M|^1/2.
-    shape = np.stack([[xx[:, 0, 0], xy[:, 0, 0]], [xy[:, 0, 0], yy[:, 0, 0]]]).transpose(2, 0, 1) / unit**2
-    p, q, r = shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]
     change = np.zeros((count, 6, 6))
     change[:, 1:3, 1:3] = shape * unit
     change[:, 3:, 3:] = unit**2 * np.stack(

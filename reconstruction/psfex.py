@@ -96,7 +96,8 @@ def load_psfex(path: str | Path) -> PsfexPsf:
     Raises
     ------
     ProductError
-        If the file is missing or none of PSFEx, or its polynomial is one of other things than positions in pixels.
+        If the file is missing or none of PSFEx, has models of several images, or its polynomial is one of other things
+        than positions in pixels.
     """
     file = Path(path)
     require_file(file, ProductError)
@@ -106,6 +107,10 @@ def load_psfex(path: str | Path) -> PsfexPsf:
             tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU) and _COLUMN in hdu.columns.names]
             if not tables:
                 raise ProductError(f"no model of PSFEx (no table with {_COLUMN})", file=file)
+            if len(tables) > 1:
+                raise ProductError(
+                    f"has {len(tables)} models of PSFEx, those of as many images: expected a file of one", file=file
+                )
             return _of_header(tables[0].header, np.asarray(tables[0].data[_COLUMN][0], dtype=np.float64), file)
 
 

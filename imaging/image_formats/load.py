@@ -22,6 +22,7 @@ from ..image_file import CcdImage
 from .fits_parts import FitsPart, FitsParts
 from .header_cards import BAND_KEYS, CHIP_KEYS, GAIN_KEYS, HeaderCards, Sourced
 from .pixel_noise import (
+    BlankImageError,
     PixelVariance,
     Sky,
     measured_variance,
@@ -43,6 +44,8 @@ _KEPT = ("OBJECT", "TELESCOP", "INSTRUME", "DATE-OBS", "MJD-OBS", "CCDNUM")
 _SOFTENING = "BSOFTEN"
 #: Bytes of a pixel, its variance and its mask.
 _PLANE_BYTES = 10
+#: Least noise of a pixel: below it variances are zero, or in coarse steps, in single precision.
+_LEAST_NOISE = 1e-21
 #: Fewest pixels along a side of an image: the stamps of stars have as many.
 _LEAST_SIDE = 32
 
@@ -105,11 +108,14 @@ class ImageSource:
         Name or number of the extension in a file of several images; None for the only one.
     n_bytes : int
         Size of its pixels, variance and mask in memory [byte].
+    among : int
+        Number of images of the file that are read, this one included.
     """
 
     path: Path
     extension: str | None = None
     n_bytes: int = field(default=0, compare=False)
+    among: int = field(default=1, compare=False)
 
 
 def image_sources(path: Path, extension: str | None = None) -> list[ImageSource]:
@@ -122,6 +128,7 @@ def image_sources(path: Path, extension: str | None = None) -> list[ImageSource]
             path,
             file.label(planes.image) if several else None,
             _PLANE_BYTES * int(np.prod(planes.image.image_shape)),
+            len(images),
         )
         for planes in images
     ]
@@ -227,8 +234,15 @@ def _image_of(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -> C
     if plane is not None:
         bad |= plane.without
     if (bad | defects.saturated).all():
-        raise ProductError("all pixels are masked, saturated or not finite: expected some that are good", file=path)
+        raise BlankImageError("all pixels are masked, saturated or not finite: expected some that are good", file=path)
     sky = Sky.of(image, bad | defects.saturated, path)
+    noise = float(np.median(sky.rms))
+    if noise < _LEAST_NOISE:
+        raise ProductError(
+            f"noise of {noise:.2g} in a pixel: expected {_LEAST_NOISE:g} or more, in a larger unit, for squares in "
+            "single precision",
+            file=path,
+        )
     light = np.where(bad, 0.0, image - sky.level)
     gain = Sourced(settings.gain, "settings") if settings.gain is not None else cards.gain()
     variance, gain = _variance(plane, sky, light, bad | defects.saturated, gain)
@@ -288,7 +302,7 @@ def _noise_plane(file: FitsParts, planes: PlaneNames, settings: ImageSettings) -
     _require_shape(noise_file, part, planes.image)
     variance = variance_of_plane(noise_file.pixels(part), kind, f"{noise_file.path.name} {part.name}".strip())
     if variance.without.all():
-        raise ProductError(f"{part.name or 'image'}: no pixel has a {kind.value} above zero", file=noise_file.path)
+        raise BlankImageError(f"{part.name or 'image'}: no pixel has a {kind.value} above zero", file=noise_file.path)
     return variance
 
 

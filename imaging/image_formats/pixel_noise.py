@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from ...core.errors import ProductError
 from ...core.noise_planes import NoiseKind
+from ...core.quantization import dithered
 from ...core.statistics import RMS_PER_MAD
 
 #: Side of the cells in which sky and noise are measured [pixel], as of the detection.
@@ -42,6 +43,10 @@ _BLUR = 1.0
 _RELATIVE = 2.0
 
 
+class BlankImageError(ProductError):
+    """No pixel of an image is good, or none has noise: that of a CCD which is out of order."""
+
+
 @dataclass(frozen=True, eq=False)
 class Sky:
     """Sky of an image: level [ny, nx] and rms noise [ny, nx] of pixels without objects."""
@@ -51,17 +56,18 @@ class Sky:
 
     @classmethod
     def of(cls, image: np.ndarray, bad: np.ndarray, path: Path) -> Sky:
-        """Measure the sky in cells; ProductError where no noise is left."""
-        data = np.ascontiguousarray(np.where(bad, 0.0, image), dtype=np.float64)
+        """Measure the sky in cells; BlankImageError where no noise is left."""
+        pixels = dithered(np.where(bad, 0.0, image), bad)
+        data = np.ascontiguousarray(pixels.values, dtype=np.float64)
         background = sep.Background(data, mask=bad, bw=_CELL, bh=_CELL)
         # Again without objects, whose wings are noise to the first one.
         blurred = ndimage.gaussian_filter(np.where(bad, 0.0, data - background.back()), _OBJECT_BLUR)
         objects = ndimage.binary_dilation(blurred > _OBJECT_LEVEL * background.rms(), iterations=_OBJECT_MARGIN)
         if (objects | bad).mean() < _MOST_OBJECTS:
             background = sep.Background(data, mask=objects | bad, bw=_CELL, bh=_CELL)
-        rms = background.rms()
+        rms = pixels.noise(background.rms())
         if not (np.isfinite(rms).all() and (rms > 0.0).all()):
-            raise ProductError("its pixels have no noise: expected an image with a sky, or its variance", file=path)
+            raise BlankImageError("its pixels have no noise: expected an image with a sky, or its variance", file=path)
         return cls(background.back(), rms)
 
 

@@ -23,6 +23,11 @@ from .fits_parts import FitsPart, FitsParts, beside
 _DES_SATURATED = 2
 #: Bit of the haloes of bright stars there, which marks an area.
 _DES_STAR = 32
+#: Bit DO_NOT_USE of JWST's planes DQ. Others, such as JUMP_DET of a cosmic ray taken out of a ramp, say what was
+#: corrected, and are set in most cores of bright stars.
+_JWST_BAD = 1
+#: Bit SATURATED there.
+_JWST_SATURATED = 2
 
 #: Ends of the names of Euclid's extensions: the pixels, their rms, their flags.
 _EUCLID_IMAGE, _EUCLID_RMS, _EUCLID_FLAGS = ".SCI", ".RMS", ".FLG"
@@ -132,8 +137,8 @@ def defects_of(values: np.ndarray, part: FitsPart, path: Path) -> Defects:
     """Return the saturated and the bad pixels that a mask marks.
 
     Cards MP_NAME number the planes of LSST's and of this program's masks; extensions MSK have the bits of DES, those of
-    Euclid its own. In any other mask pixels that are not zero are bad: codes of other pipelines change with their
-    versions.
+    Euclid and of JWST (DQ) their own. In any other mask pixels that are not zero are bad: codes of other pipelines
+    change with their versions.
 
     Raises
     ------
@@ -155,4 +160,7 @@ def defects_of(values: np.ndarray, part: FitsPart, path: Path) -> Defects:
     if part.name == "MSK":
         bits = values.astype(np.int64)
         return Defects((bits & _DES_SATURATED) != 0, (bits & ~np.int64(_DES_SATURATED | _DES_STAR)) != 0)
+    if part.name == "DQ" and str(part.header.get("TELESCOP")).strip() == "JWST":
+        bits = values.astype(np.int64)
+        return Defects((bits & _JWST_SATURATED) != 0, (bits & _JWST_BAD) != 0)
     return Defects(np.zeros(values.shape, dtype=bool), values != 0)

@@ -68,9 +68,9 @@ def world_cards(header: fits.Header, shape: tuple[int, int], path: Path) -> fits
                 key="CTYPE1",
             ) from None
     sides = np.prod(np.hypot(*wcs.pixel_scale_matrix))
-    # wcslib puts a one in the place of a column of zeros.
+    # wcslib puts a one in the place of a column of zeros, and takes a matrix of zeros for none.
     matrix = np.array([[float(cards.get(f"CD{i}_{j}", 0.0)) for j in (1, 2)] for i in (1, 2)])
-    singular = matrix.any() and not np.linalg.det(matrix)
+    singular = any(key.startswith("CD") and key[2].isdigit() for key in cards) and not np.linalg.det(matrix)
     if singular or not (np.isfinite(scale) and scale > _FLAT * sides > 0.0):
         raise ProductError("CD1_1, CD1_2, CD2_1, CD2_2: expected a matrix with an inverse", file=path, key="CD1_1")
     if not wcs.has_celestial or not np.isfinite(sky).all():

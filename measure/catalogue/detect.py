@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.quantization import dithered
 from ...core.units import real_array, require_count, require_positive
 from ..shapes import fwhm
 from .cutouts import cut_out
@@ -112,7 +113,8 @@ def detect_objects(
         try:
             level = np.zeros_like(data)
             if background_size is not None:
-                level = sep.Background(data, mask=ignored, bw=background_size, bh=background_size).back()
+                sky = np.ascontiguousarray(dithered(data, ignored).values)
+                level = sep.Background(sky, mask=ignored, bw=background_size, bh=background_size).back()
                 data = np.where(ignored, 0.0, data - level)
             sep_objects, segmentation = sep.extract(data, var=variances, mask=ignored, segmentation_map=True, **options)
         except Exception as error:  # SEP raises Exception itself

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.errors import DomainError
+from ...core.number_text import counted
 from ...core.units import real_array
 from ..pixel_masks import bad_pixels
 from .cutouts import cut_out
@@ -105,6 +106,8 @@ def smallest_stars(
     cuts[objects.neighbour_distance < isolation] |= StarCut.NEIGHBOUR
     cuts[~(objects.fwhm >= LEAST_FWHM)] |= StarCut.WIDTH
     candidates = np.flatnonzero(cuts == 0)
+    if len(candidates) < FEWEST_STARS:
+        raise DomainError(f"no stars: {_left_out_text(cuts, min_snr)}")
     order = candidates[np.argsort(objects.half_light_radius[candidates], kind="stable")]
     radii = objects.half_light_radius[order]
     reason = f"the smallest ones are of different sizes, expected {FEWEST_STARS} of one"
@@ -123,6 +126,22 @@ def smallest_stars(
         reason = f"{count} of the {len(group)} smallest ones have one width and ellipticity, expected at least {least}"
         break
     raise DomainError(f"no stars: of {len(order)} isolated objects of S/N above {min_snr:g} {reason}")
+
+
+def _left_out_text(cuts: np.ndarray, min_snr: float) -> str:
+    """Return the words for objects among which there are too few candidates, and for the reasons."""
+    reasons = {
+        StarCut.FAINT: f"of S/N below {min_snr:g}",
+        StarCut.FLAGGED: "saturated, blended, or with masked pixels or an edge on their stamps",
+        StarCut.NEIGHBOUR: "with a neighbour",
+        StarCut.WIDTH: f"of a FWHM below {LEAST_FWHM:g} pixels",
+    }
+    counts = {text: int(((cuts & cut) != 0).sum()) for cut, text in reasons.items()}
+    of_reasons = ", ".join(f"{count} {text}" for text, count in counts.items() if count)
+    return (
+        f"{int((cuts == 0).sum())} of {counted(len(cuts), 'object')} may be stars, expected at least {FEWEST_STARS}"
+        + f" (left out: {of_reasons})" * bool(of_reasons)
+    )
 
 
 def _cuts_of_single_objects(

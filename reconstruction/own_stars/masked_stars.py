@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.quantization import dithered
 from ...core.statistics import RMS_PER_MAD, finite_row_medians, masked_median, robust_rms
 from ...core.threads import one_blas_thread
 from ...measure.masked_moments import MOST_MASKED
@@ -66,16 +67,17 @@ def sky_of_stamps(images: np.ndarray, bad: np.ndarray, radius: float) -> tuple[n
     y, x = np.indices(images.shape[1:]) - 0.5 * (np.array(images.shape[1:])[:, None, None] - 1.0)
     distance = np.hypot(x, y)
     outside = distance > radius
-    sky = np.where(bad[:, outside], np.nan, images[:, outside])
+    pixels = dithered(images, bad)
+    sky = np.where(bad[:, outside], np.nan, pixels.values[:, outside])
     sparse = (~bad[:, outside]).sum(axis=1) < min(_FEWEST_SKY, outside.sum())
     level, rms = np.full((2, len(images)), np.nan)
     level[~sparse] = finite_row_medians(sky[~sparse])
     rms[~sparse] = RMS_PER_MAD * finite_row_medians(np.abs(sky[~sparse] - level[~sparse, None]))
     for i in np.flatnonzero(sparse & ~bad.all(axis=(1, 2))):
         far = ~bad[i] & (distance >= np.quantile(distance[~bad[i]], 1.0 - _OUTERMOST))
-        level[i] = np.median(images[i][far])
-        rms[i] = robust_rms(images[i][far])
-    return level, rms
+        level[i] = np.median(pixels.values[i][far])
+        rms[i] = robust_rms(pixels.values[i][far])
+    return level, pixels.noise(rms)
 
 
 def inner_pixels(shape: tuple[int, ...], size: int, wide: Shapes) -> tuple[slice, slice, slice]:
@@ -157,7 +159,7 @@ def fill_by_median_star(
         filled, x, y = images.copy(), earlier.x.copy(), earlier.y.copy()
         usable, star = earlier.usable.copy(), earlier.median_star
         if not star.any():
-            star = _median_star(images, bad, x, y, sigma)
+            star = _median_star(images[usable], bad[usable], x[usable], y[usable], sigma)
         filled[masked] = fill_by_profiles(images[masked], bad[masked], star, x[masked], y[masked], sigma)[0]
     moving = masked
     places_before, steps_before = np.full((2, len(images), 2), np.nan)

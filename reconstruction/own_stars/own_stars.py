@@ -235,6 +235,7 @@ def fit_own_stars(
     stars = stars.usable_ones(shapes.usable)
     _require_used(stars, min_snr, gain)
     used = stars.used
+    _require_places_apart(places[used])
     used_indices = np.flatnonzero(used)
     parts = np.array_split(
         stream(require_seed(seed), "held-out stars").permutation(len(used_indices)), min(FOLDS, len(used_indices))
@@ -279,11 +280,13 @@ class _CentredStars:
 
         `sigma` is that of the weight of the moments.
         """
-        good = self.images[self.flags == 0]
-        with_defects = (self.flags != 0) & ((self.flags & ~_MASKABLE) == 0)
-        if not len(good) or not with_defects.any():
+        good = self.flags == 0
+        with_defects = ~good & ((self.flags & ~_MASKABLE) == 0)
+        if not with_defects.any():
             return np.zeros(len(self.flags), dtype=bool)
-        star = median_star(good.reshape(len(good), -1)).reshape(good.shape[1:])
+        # Where hardly any star is without a neighbour, those of the others are at many places, and no part of a median.
+        compared = self.images[good if good.sum() >= FEWEST_STARS else good | with_defects]
+        star = median_star(compared.reshape(len(compared), -1)).reshape(compared.shape[1:])
         return with_defects & apart_from_core(defects, star, sigma)
 
     def usable_ones(self, usable: np.ndarray) -> _CentredStars:
@@ -303,6 +306,18 @@ def _require_used(stars: _CentredStars, min_snr: float, gain: float) -> None:
             f"gain = {gain:g}"
         )
     require_stars(stars.used, np.where(stars.used, 0, stars.flags), FEWEST_STARS, reason)
+
+
+def _require_places_apart(places: np.ndarray) -> None:
+    """Raise DomainError where stars have one place [n, 2]: their doubles would predict those that are held out."""
+    first = np.unique(places, axis=0, return_index=True)[1]
+    doubles = np.setdiff1d(np.arange(len(places)), first)
+    if len(doubles) and len(first) > 1:
+        x, y = places[doubles[0]]
+        raise DomainError(
+            f"positions: {len(doubles)} of {counted(len(places), 'star')} stand there twice, such as that at "
+            f"({x:g}, {y:g}): expected each once"
+        )
 
 
 def _flux_and_snr(stamps: np.ndarray, rms: np.ndarray, gain: float) -> tuple[np.ndarray, np.ndarray]:

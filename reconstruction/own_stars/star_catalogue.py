@@ -117,9 +117,10 @@ def load_stars(
     Parameters
     ----------
     catalogue : str or Path
-        The table; of a FITS file its first one with a position. The names of columns may be in any case. A table of one
-        row, each column of which holds all stars, is read too (Piff's test data). A FITS file without such a table may
-        hold stamps one by one, in extensions IMAGE, MASK and VARIANCE with EXTVER, as the LSST pipelines write them.
+        The table; of a FITS file its first one with a position, the only one that has stamps too. The names of columns
+        may be in any case. A table of one row, each column of which holds all stars, is read too (Piff's test data). A
+        FITS file without such a table may hold stamps one by one, in extensions IMAGE, MASK and VARIANCE with EXTVER,
+        as the LSST pipelines write them.
     x, y : str
         Columns of the positions, in any unit; for "x" and "y" names of SExtractor and of LSST stand in,
         :data:`OTHER_NAMES`.
@@ -145,8 +146,8 @@ def load_stars(
     Raises
     ------
     ProductError
-        If a file is missing, cut short, of another kind, or lacks a column, or no pixel has weight; one line that names
-        it.
+        If a file is missing, cut short, of another kind, has tables of several images, or lacks a column, or no pixel
+        has weight; one line that names it.
     """
     path = Path(catalogue)
     data = read_bytes(path, ProductError)
@@ -158,6 +159,12 @@ def load_stars(
         with parsing(path, "damaged or not FITS", ProductError):
             # SExtractor's LDAC files have a table of the image's header before that of the objects.
             table = next((t for t in tables if _find_column(x, t.columns.names)), tables[0] if tables else None)
+            with_stamps = [t for t in tables if all(_find_column(name, t.columns.names) for name in (x, y, stamp))]
+        if len(with_stamps) > 1:
+            raise ProductError(
+                f"has {len(with_stamps)} tables of stars, such as those of several CCDs: expected that of one image",
+                file=path,
+            )
         if (table is None or not _find_column(x, table.columns.names)) and is_stamp_file(hdus):
             if colour is not None:
                 raise ProductError(f"has stamps without a table, expected one with a column {colour!r}", file=path)

@@ -21,6 +21,13 @@ def test_all_planes_but_harmless_ones_are_bad():
         bad_bits({"MP_BAD": 63}, FILE)
 
 
+def test_pixels_that_an_image_of_a_stack_is_left_out_of_are_harmless():
+    """INEXACT_PSF is the union of the three; bright cores of stars are often clipped."""
+    names = ("CLIPPED", "REJECTED", "SENSOR_EDGE", "INEXACT_PSF", "NO_DATA")
+    header = fits.Header({f"HIERARCH MP_{name}": bit for bit, name in enumerate(names)})
+    assert bad_bits(header, FILE) == 1 << names.index("NO_DATA")
+
+
 @pytest.mark.parametrize("name", ["SAT", "NO_DATA"])
 def test_cards_of_planes_are_read_as_they_were_written(name):
     header = fits.Header()

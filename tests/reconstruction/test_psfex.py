@@ -72,3 +72,12 @@ def test_files_that_are_no_models(tmp_path):
     (tmp_path / "a.psf").write_bytes(b"text")
     with pytest.raises(ProductError, match="damaged or no FITS file of PSFEx"):
         pachon.reconstruction.load_psfex(tmp_path / "a.psf")
+
+
+def test_models_of_several_images_are_refused(tmp_path):
+    """SExtractor and PSFEx make one of each CCD of an exposure; the first one was taken for all."""
+    path = write_model(tmp_path / "a.psf")
+    with fits.open(path) as hdus:
+        fits.HDUList([fits.PrimaryHDU(), hdus[1].copy(), hdus[1].copy()]).writeto(tmp_path / "b.psf")
+    with pytest.raises(ProductError, match=r"b\.psf: has 2 models of PSFEx, those of as many images: expected a file"):
+        pachon.reconstruction.load_psfex(tmp_path / "b.psf")

@@ -37,3 +37,16 @@ def test_axes_of_length_one_are_none(field, tmp_path, kind, options):
     np.testing.assert_array_equal(image.variance, expected.variance)
     pixel = np.array([[10.0, 20.0]])
     np.testing.assert_array_equal(image.celestial(pixel), expected.celestial(pixel))
+
+
+def test_flags_of_jwst_that_mark_corrected_pixels_are_harmless(field, tmp_path):
+    """Jumps that were taken out of ramps stand in the cores of most bright stars: no star was left."""
+    flags = np.full(field.image.shape, 4, np.uint32)
+    flags[5, 7], flags[8, 9], flags[11, 12] = 1 | 4, 2 | 4, 1 | 2
+    planes = fits.ImageHDU(np.sqrt(field.variance), name="ERR"), fits.ImageHDU(flags, name="DQ")
+    primary = fits.PrimaryHDU(header=fits.Header({"TELESCOP": "JWST", "INSTRUME": "NIRCAM"}))
+    path = write(tmp_path / "a_cal.fits", primary, fits.ImageHDU(field.image, header_of(), name="SCI"), *planes)
+    image = pachon.load_image(path)
+    saturated, bad = 1, 2
+    assert [image.mask[place] for place in ((5, 7), (8, 9), (11, 12))] == [bad, saturated, saturated]
+    assert (image.mask != 0).sum() == 3

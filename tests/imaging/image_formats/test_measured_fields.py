@@ -1,9 +1,11 @@
 """Images of other programs measured: shapes and fluxes against the truth, few stars, stars and PSFs of one's own."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
+import drawn_fields
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -14,8 +16,11 @@ from scipy import ndimage
 import pachon
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, PachonError, ProductError
+from pachon.core.long_work import Execution
+from pachon.imaging.image_formats.load import ImageSource
 from pachon.imaging.image_psf import psfs_on
 from pachon.imaging.image_stars import detected_objects, few_or_many_stars
+from pachon.imaging.measure_files import FileMeasurement, MeasureOptions, images_among, measure_files
 from pachon.imaging.star_positions import table_in
 from pachon.measure.catalogue.matching import match_positions
 
@@ -72,6 +77,33 @@ def test_galaxies_of_a_plain_image_have_their_shapes_and_fluxes(catalogue, field
     np.testing.assert_allclose(table["g2_sky"][good], table["e2"][good], atol=2e-3)
     assert catalogue.warnings == ()
     assert len(catalogue.stars) >= 25
+
+
+@pytest.mark.parametrize("extension", ["CCD 1/2", "../../x", "DET1.CHIP1"])
+def test_products_stay_beside_their_image_whatever_its_extension_is_called(tmp_path, extension):
+    """The slash of an extension was that of a folder: the command ended after the image was measured."""
+    product = FileMeasurement(None, MeasureOptions()).product(ImageSource(tmp_path / "a.fits", extension), "_psf")
+    assert product.parent == tmp_path
+    assert images_among([tmp_path / "a.fits", product]) == [tmp_path / "a.fits"]
+
+
+def test_why_no_object_may_be_a_star(field, tmp_path):
+    """Of an image with scattered bad pixels the message was that of 0 objects the smallest are of different sizes."""
+    pixels = field.image.copy()
+    pixels[np.random.default_rng(1).random(pixels.shape) < 0.03] = np.nan
+    fits.PrimaryHDU(pixels, header_of()).writeto(tmp_path / "a.fits")
+    text = r"no stars: 0 of \d+ objects may be stars, expected at least 3 \(left out: .*\d+ saturated, .* masked pixels"
+    with pytest.raises(DomainError, match=text):
+        pachon.measure_image(pachon.load_image(tmp_path / "a.fits"), threads=1)
+
+
+def test_stars_too_sharp_for_the_pixels_are_told(tmp_path, monkeypatch):
+    """Errors of ellipticities were two to nine times those given at a FWHM of 1.8 to 1.5 pixels, without a word."""
+    monkeypatch.setattr(drawn_fields, "PSF", (0.5, 0.0, 0.5))
+    catalogue = pachon.measure_image(loaded(draw_field(15, 5, side=200), tmp_path), threads=1)
+    (warning,) = catalogue.warnings
+    assert re.match(r"its stars have a FWHM of 1\.[5-9]\d* pixels: below 2 ", warning)
+    assert catalogue.metrics()["warnings"] == [warning]
 
 
 @pytest.mark.slow
@@ -284,6 +316,33 @@ def test_a_psf_model_of_piff_takes_colours(image):
     np.testing.assert_allclose(drawn, direct / direct.sum(axis=(1, 2), keepdims=True), rtol=1e-12)
     with pytest.raises(DomainError, match="properties: expected values of"):
         psfs_on(image, model, places, 1, np.nan)
+
+
+def test_stars_on_the_shallow_part_of_a_stack(field, tmp_path):
+    """The noise of the deeper half of the pixels made defects of theirs: of 7 none was left."""
+    shallow = np.arange(len(field.image)) < 150
+    variance = np.where(shallow, 9.0, 1.0) * field.variance
+    noise = np.random.default_rng(2).normal(size=variance.shape) * np.sqrt(variance - field.variance)
+    planes = fits.PrimaryHDU(field.image + noise, header_of()), fits.ImageHDU(variance, name="VARIANCE")
+    fits.HDUList(list(planes)).writeto(tmp_path / "a.fits")
+    image = pachon.load_image(tmp_path / "a.fits")
+    stars = few_or_many_stars(image, detected_objects(image), 30.0)
+    inner = (np.abs(field.places[field.star] - 0.5 * len(field.image)) < 140.0).all(axis=1)
+    expected = (field.places[field.star, 0] < 145.0) & inner
+    assert expected.sum() > 5
+    assert (stars.positions[:, 0] < 145.0).sum() >= expected.sum() - 1
+
+
+def test_ccds_that_are_out_of_order_are_left_out(tmp_path):
+    """DECam has two: the command ended at the first of them, and --resume as well."""
+    field = draw_field(12, 3, side=160)
+    dead = [np.zeros_like(field.image), np.full_like(field.image, np.nan)]
+    ccds = [fits.ImageHDU(pixels, header_of(), name=f"N{i}") for i, pixels in enumerate([*dead, field.image])]
+    fits.HDUList([fits.PrimaryHDU(), *ccds]).writeto(tmp_path / "a.fits")
+    measured = measure_files([tmp_path / "a.fits"], execution=Execution(threads=1))
+    assert list(measured.metrics) == ["a.fits[N2]"]
+    assert "its pixels have no noise" in measured.left_out["a.fits[N0]"]
+    assert "all pixels are masked" in measured.left_out["a.fits[N1]"]
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """PSF models of stars from other programs: what is kept, how well held-out stars are predicted, and the command."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from astropy.io import fits
 from astropy.table import Table
 from matplotlib.figure import Figure
 
+import pachon
 from pachon import PsfModel
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError
@@ -190,6 +192,57 @@ def test_the_command_leaves_model_picture_and_table(stars, tmp_path, monkeypatch
     table = Table.read("stars_psf.ecsv")
     assert len(table) == COUNT
     assert np.isnan(table["held_out_e1"][5])
+
+
+@pytest.mark.parametrize("options", [{}, {"interpolation": "polynomial", "order": 0}])
+def test_stars_listed_twice_are_refused(stars, options):
+    """The message counted among those used; polynomials took them, and predicted each star from its double."""
+    rows = np.append(np.arange(30), [7, 12])
+    with pytest.raises(DomainError, match=r"positions: 2 of 31 stars stand there twice, such as that at \(\d+\.?\d*, "):
+        fit_own_stars(stars.stamps[rows], stars.positions[rows], PIXEL, **options)
+
+
+@pytest.mark.parametrize("empty", [(), (3,)])
+def test_stars_that_all_have_neighbours_are_masked(stars, empty):
+    """Of a crowded field none was left; with one star without a neighbour all were used. A lost stamp has no place."""
+    rng = np.random.default_rng(5)
+    stamps = stars.stamps[10:30] - 300.0
+    for stamp, (row, column) in zip(stamps, rng.choice([-10, 10], (20, 2)), strict=True):
+        stamp += 0.5 * np.roll(stamp, (row, column), axis=(0, 1))
+    stamps[list(empty)] = rng.normal(0.0, SKY, (len(empty), SIZE, SIZE))
+    own = fit_own_stars(stamps, stars.positions[10:30], PIXEL, interpolation="polynomial", order=0)
+    assert (own.flags[own.used] & StarFlag.NEIGHBOUR).all()
+    assert own.used.sum() >= 18
+    alone = fit_own_stars(stars.stamps[10:30], stars.positions[10:30], PIXEL, interpolation="polynomial", order=0)
+    sizes = [pachon.adaptive_moments(fit.model.at([[2e3, 2e3]]), PIXEL).T[0] for fit in (own, alone)]
+    assert sizes[0] == pytest.approx(sizes[1], rel=5e-3)
+
+
+@pytest.mark.parametrize("level", [300.3, 300.45])
+def test_stamps_of_whole_numbers(stars, level):
+    """As cameras write them: medians of whole numbers as sky made models 1 % too large, and S/N 15 % wrong."""
+    light = (stars.stamps[10:30] - 300.0) / 40.0 + level
+    fits = [fit_own_stars(stamps, stars.positions[10:30], PIXEL, gain=40.0) for stamps in (light, np.rint(light))]
+    sizes = [pachon.adaptive_moments(fit.model.at([[2e3, 2e3]]), PIXEL).T[0] for fit in fits]
+    assert sizes[1] == pytest.approx(sizes[0], rel=2e-3)
+    assert np.median(fits[1].snr) == pytest.approx(np.median(fits[0].snr), rel=0.05)
+
+
+def test_undersampled_stars_have_no_adaptive_moments(tmp_path, monkeypatch, capsys):
+    """As of HSM, whose matrix becomes singular: the table of the command ended in a TypeError."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(3)
+    positions, centres = rng.uniform(0.0, 1000.0, (12, 2)), rng.uniform(-0.2, 0.2, (12, 2, 1, 1))
+    y, x = np.indices((21, 21)) - 10
+    light = (
+        4e4 / (2.0 * np.pi * 0.45**2) * np.exp(-0.5 * ((x - centres[:, 0]) ** 2 + (y - centres[:, 1]) ** 2) / 0.45**2)
+    )
+    stamps = light + rng.normal(size=light.shape) * np.sqrt(25.0 + light)
+    Table({"x": positions[:, 0], "y": positions[:, 1], "stamp": stamps}).write("stars.fits")
+    assert main(["model", "stars.fits", "--no-picture", "--interpolation", "polynomial", "--order", "0"]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"rms of g, weighted e of the stars +-, \d+\.\d\d %", out)
+    assert re.search(r"rms dT/T, held out +-\s", out)
 
 
 def test_stars_that_sextractor_flags_are_left_out(stars, tmp_path, monkeypatch, capsys):

@@ -249,3 +249,13 @@ def test_the_example_of_the_documentation_runs(tmp_path, monkeypatch):
     truth = np.exp(-0.5 * (x**2 + y**2) / (1.7 + 0.1 * 1024.0 / 4000.0) ** 2)
     # Thirty stars of S/N above 200: two per cent of the peak.
     np.testing.assert_allclose(names["psf"], truth / truth.sum(), atol=0.02 * truth.max() / truth.sum())
+
+
+def test_stars_of_several_ccds_are_refused(tmp_path):
+    """As SExtractor writes for an exposure: those of its first CCD were taken, without a word."""
+    stamps, positions = stars()
+    table = fits.BinTableHDU(Table({"XWIN_IMAGE": positions[:, 0], "YWIN_IMAGE": positions[:, 1], "VIGNET": stamps}))
+    path = tmp_path / "ccds.cat"
+    fits.HDUList([fits.PrimaryHDU(), table, table.copy()]).writeto(path)
+    with pytest.raises(ProductError, match=r"ccds\.cat: has 2 tables of stars, .* several CCDs: expected that of one"):
+        load_stars(path)

@@ -99,6 +99,15 @@ def test_the_command_writes_tables_and_prints_json(stars, found, tmp_path, capsy
     assert capsys.readouterr().err.strip().endswith("none.piff: no such file")
 
 
+def test_stars_that_sextractor_flags_are_left_out_as_of_a_model(stars, tmp_path, monkeypatch):
+    monkeypatch.setattr("pachon.reconstruction.piff.comparison.rho_plot", lambda rho: b"a picture")
+    path, (x, y) = tmp_path / "stars.fits", stars[1].T
+    Table({"x": x, "y": y, "stamp": stars[0], "FLAGS": np.arange(len(x)) % 3}).write(path)
+    assert main(["diagnose", str(path), "--piff", str(DATA / "gaussian.piff"), "--quiet"]) == 0
+    # 1, with neighbours, is none of the bits; 2 is blended.
+    assert set(Table.read(tmp_path / "stars_piff" / "stars.ecsv")["x"]) <= set(x[np.arange(len(x)) % 3 < 2])
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [
