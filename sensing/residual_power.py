@@ -26,7 +26,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.linalg import cho_factor, solve_triangular, toeplitz
@@ -66,19 +66,33 @@ class ResidualPower:
         Power of what the model lacks, in combinations of the unknowns that are independent of unit variance.
     strength : float
         Strength of the field of patterns, of which the power has nothing.
-    losses : ndarray, shape [n_rms], optional
-        Losses of the residuals by the rms of that field, at :data:`~pachon.sensing.residual_patterns.RMS_LOGARITHMS`.
+    figure : float
+        Strength of what the telescope is expected to have in them.
+    losses : ndarray, shape [n_figure, n_rms], optional
+        Losses of the residuals by the rms of what the telescope has, and of that field, of
+        :mod:`~pachon.sensing.residual_patterns`.
     """
 
     root: np.ndarray
     power: np.ndarray
     strength: float = 0.0
+    figure: float = 1.0
     losses: np.ndarray | None = None
 
     @property
     def covariance(self) -> np.ndarray:
         """Covariance of the unknowns by what the model lacks, shape [n, n]."""
         return np.asarray(self.root @ self.power @ self.root.T)
+
+
+class TelescopePatterns(NamedTuple):
+    """Patterns of the telescope's further terms over the noise: of the rms expected, [n_pixel, k], and as priors have.
+
+    Those of priors are of the terms that are fitted, [n_pixel, l].
+    """
+
+    expected: np.ndarray
+    fitted: np.ndarray
 
 
 class Field(Protocol):
@@ -101,7 +115,7 @@ def residual_power(
     covariance: np.ndarray,
     resolution: float,
     patterns: np.ndarray | None = None,
-    expected: np.ndarray | None = None,
+    telescope: TelescopePatterns | None = None,
     prior_gradient: np.ndarray | None = None,
 ) -> ResidualPower:
     """Return what the residuals of a donut say about the errors of its unknowns.
@@ -116,8 +130,8 @@ def residual_power(
         Width of the finest detail of the image [pixels].
     patterns : ndarray, shape [n_pixel, m], optional
         Patterns over the noise, whose squares are the covariance of a further field.
-    expected : ndarray, shape [n_pixel, m], optional
-        The same of what the model is known to lack, within the span of the patterns.
+    telescope : TelescopePatterns, optional
+        The same of what the telescope is expected to have, within the span of the patterns.
     prior_gradient : ndarray, shape [n], optional
         Precisions of the priors times the deviations of the unknowns from their means: residuals are then those at the
         end of the last step of a search, which stops a part of a standard deviation short of it.
@@ -142,9 +156,12 @@ def residual_power(
         inner, of_patterns = residuals.power(n)
     if beside is None:
         return ResidualPower(root, inner)
-    of_telescope = np.zeros_like(of_patterns) if expected is None else beside.power_of(squares.of(expected))
-    sizes = beside.sizes(of_patterns, of_telescope)
-    return ResidualPower(root, inner + sizes.level * (np.eye(n) + inner), sizes.strength, sizes.losses)
+    of_telescope, fitted = np.zeros((2, *of_patterns.shape))
+    if telescope is not None:
+        of_telescope = beside.power_of(squares.of(telescope.expected))
+        fitted = beside.power_of(squares.of(telescope.fitted))
+    sizes = beside.sizes(of_patterns, of_telescope, fitted)
+    return ResidualPower(root, inner + sizes.level * (np.eye(n) + inner), sizes.strength, sizes.figure, sizes.losses)
 
 
 class _Squares:
