@@ -199,6 +199,13 @@ class FitOptions:
             rich_help_panel=_FIT,
         ),
     ] = None
+    shared_air: Annotated[
+        float | None,
+        Option(
+            help="Part of the air's variance that all donuts share, if known; fitted about the site's.",
+            rich_help_panel=_FIT,
+        ),
+    ] = None
     degrees_of_freedom: Annotated[
         str | None,
         names(
@@ -244,7 +251,7 @@ class FitOptions:
         from ..sensing.model import DonutAir
         from ..wavefront.atmosphere.atmosphere import Atmosphere
 
-        air = DonutAir(outer_scale=outer_scale, site=self.site)
+        air = DonutAir(outer_scale=outer_scale, site=self.site, shared=self.shared_air)
         if self.exposure_s is None:
             return air
         return replace(air, atmosphere=Atmosphere.from_site(air.layers(telescope), 0, exposure=self.exposure_s))

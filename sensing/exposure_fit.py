@@ -178,6 +178,7 @@ class ExposureDonuts(WavefrontFit):
             hierarchy.total_covariance + figure,
             hierarchy.total - hierarchy.telescope,
             0.0 if no_air else hierarchy.sizes.air,
+            hierarchy.sizes.shared,
             hierarchy.sizes.noise,
             sides,
             _notices(consistent, zernikes, usable.index, sides),

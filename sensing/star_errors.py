@@ -218,7 +218,7 @@ def air_of_zernikes(instrument: Instrument) -> np.ndarray:
 
 def exposure_air(instrument: Instrument, rms: float | None = None, losses: np.ndarray | None = None) -> ExposureAir:
     """Return the mean wavefront of an exposure, of an rms of Z4 to Z22 [m] if it is known, with what residuals say."""
-    return ExposureAir(air_of_zernikes(instrument), instrument.shared_air, rms, losses)
+    return ExposureAir(air_of_zernikes(instrument), instrument.shared_air, instrument.shared_air_spread, rms, losses)
 
 
 def air_losses(instrument: Instrument, stars: Sequence[StarSolution]) -> np.ndarray | None:
