@@ -31,6 +31,8 @@ _FIGURES = np.geomspace(0.1, 5.0, 8)
 _FIGURES_WIDE = 1.0
 #: Probability beforehand of the least one.
 _WELL_FIGURED = 0.1
+#: Loss of the logarithm of the likelihood from which on nothing is said of larger ones.
+_HOPELESS = 20.0
 #: Least variance by noise of an amplitude that fitted terms take up, over that by noise alone: derivatives are as good.
 _LEAST_NOISE = 5e-3
 #: Loss of the logarithm of the likelihood by a level that is fitted.
@@ -105,7 +107,12 @@ class Patterns:
         values, vectors = np.linalg.eigh(np.eye(len(fitted)) - fitted)
         noise = others + vectors * np.maximum(values, _LEAST_NOISE) @ vectors.T
         figures = _FIGURES if telescope.any() else np.ones(1)
-        losses, surplus = np.moveaxis([self._losses(noise + size**2 * telescope) for size in figures], 1, 0)
+        losses = np.full((len(figures), 2, len(strengths)), np.inf)
+        surplus = np.zeros_like(losses)
+        for k, size in enumerate(figures):
+            losses[k], surplus[k] = self._losses(noise + size**2 * telescope)
+            if losses[k].min() > losses.min() + _HOPELESS:
+                break
         of_rms = _prior((RMS_LOGARITHMS - _USUAL) / _WIDE, _NONE)
         posterior = _figure_prior(len(figures))[:, None, None] * of_rms * np.exp(losses.min() - losses)
         posterior /= posterior.sum()

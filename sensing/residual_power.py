@@ -29,7 +29,7 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.linalg import cho_factor, solve_triangular, toeplitz
+from scipy.linalg import solve_triangular, toeplitz
 from scipy.optimize import nnls
 
 from .likelihood import Linearized
@@ -147,7 +147,8 @@ def residual_power(
         pulls = pulls - columns @ (columns.T @ pulls - root.T @ prior_gradient).astype(np.float32)
     beside = None if patterns is None else Patterns.of(squares.of(patterns), columns, pulls)
     if beside is not None:
-        pulls, columns = pulls - beside.columns @ beside.amplitudes, np.hstack([columns, beside.columns])
+        pulls = pulls - beside.columns @ beside.amplitudes.astype(np.float32)
+        columns = np.hstack([columns, beside.columns])
     n = len(root)
     residuals = _Residuals(squares.used, pulls, columns, _fields(linearized, squares, resolution))
     if max(residuals.excess(name) for name in _SCREENED) < _SIGNIFICANT:
@@ -353,9 +354,9 @@ class StationaryField:
             return other.product(self)
         # The product of two Gaussians is one.
         length = 1.0 / math.hypot(1.0 / self._length, 1.0 / other._length)
-        rows, along = (_gaussian(n, length) for n in self._used.shape)
         if self._even and other._even:
-            return float(rows.sum() * along.sum())
+            return math.prod(_sum_of_gaussian(n, length) for n in self._used.shape)
+        rows, along = (_gaussian(n, length) for n in self._used.shape)
         amplitude = self._amplitude * other._amplitude
         return float((amplitude * (rows @ amplitude @ along)).sum())
 
@@ -367,6 +368,12 @@ def _gaussian(count: int, length: float) -> np.ndarray:
     matrix = np.asarray(toeplitz(np.where(correlation > _UNCORRELATED, correlation, 0.0)))
     matrix.flags.writeable = False
     return matrix
+
+
+@lru_cache(maxsize=256)
+def _sum_of_gaussian(count: int, length: float) -> float:
+    """Return the sum of the Gaussian correlations of places on a line, of a length [pixels]."""
+    return float(_gaussian(count, length).sum())
 
 
 def _fields(linearized: Linearized, squares: _Squares, resolution: float) -> dict[str, Field]:
@@ -414,9 +421,9 @@ def _strengths(products: np.ndarray, surplus: np.ndarray, least: np.ndarray) -> 
     scale = np.sqrt(np.diag(products))
     normalized = products / np.outer(scale, scale)
     normalized[np.diag_indices_from(normalized)] += _RIDGE
-    factor = np.tril(cho_factor(normalized, lower=True)[0])
-    beyond = solve_triangular(factor, (surplus - products @ least) / scale, lower=True)
-    strengths = solve_triangular(factor, beyond, lower=True, trans="T")
+    factor = np.linalg.cholesky(normalized)
+    beyond = solve_triangular(factor, (surplus - products @ least) / scale, lower=True, check_finite=False)
+    strengths = solve_triangular(factor, beyond, lower=True, trans="T", check_finite=False)
     if strengths.min() < 0.0:
         strengths, _ = nnls(factor.T, beyond)
     return np.asarray(strengths / scale + least)
