@@ -233,7 +233,7 @@ def air_losses(instrument: Instrument, stars: Sequence[StarSolution]) -> np.ndar
     losses = [values for values in of_stars if values is not None]
     # Squares of two amplitudes are correlated as the square of the correlation of these.
     alike = 1.0 + (len(losses) - 1) * instrument.shared_air**2
-    return losses_of_field(_TRUST / alike * sum(losses)) if losses else None
+    return losses_of_field(_TRUST / alike * np.sum(np.broadcast_arrays(*losses), axis=0)) if losses else None
 
 
 def further_strength(instrument: Instrument, stars: Sequence[StarSolution], air_rms: float) -> float:
@@ -243,7 +243,7 @@ def further_strength(instrument: Instrument, stars: Sequence[StarSolution], air_
     """
     losses = [errors.air_losses for errors in (star_errors(instrument, star) for star in stars)]
     of_stars = [values for values in losses if values is not None]
-    return figure_strength(sum(of_stars) / len(of_stars), air_rms / AIR_UNIT) if of_stars else 1.0
+    return figure_strength(np.mean(np.broadcast_arrays(*of_stars), axis=0), air_rms / AIR_UNIT) if of_stars else 1.0
 
 
 def air_of(instrument: Instrument, last: int) -> np.ndarray:
