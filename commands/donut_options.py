@@ -43,6 +43,8 @@ _DEFAULT_PIXEL_UM = 10.0
 #: Least and greatest side of a pixel, and greatest shift of a body [um].
 _PIXELS_UM = (1.0, 1e4)
 _MOST_DEFOCUS_UM = 1e5
+#: Least and greatest part of the air that donuts share.
+_SHARED_AIR = (0.01, 0.99)
 
 
 @dataclass(frozen=True)
@@ -199,6 +201,13 @@ class FitOptions:
             rich_help_panel=_FIT,
         ),
     ] = None
+    shared_air: Annotated[
+        float | None,
+        Option(
+            help="Part of the air's variance that all donuts share, if known; fitted about the site's.",
+            rich_help_panel=_FIT,
+        ),
+    ] = None
     degrees_of_freedom: Annotated[
         str | None,
         names(
@@ -230,7 +239,9 @@ class FitOptions:
     threads: Threads = None
 
     def check(self) -> None:
-        """Check that options go together."""
+        """Check a range, and that options go together."""
+        if self.shared_air is not None:
+            _require_within("--shared-air", self.shared_air, _SHARED_AIR, unit="")
         if self.each_alone and self.degrees_of_freedom is not None:
             raise ConfigError("--each-alone and --degrees-of-freedom: expected one of them")
 
@@ -244,7 +255,7 @@ class FitOptions:
         from ..sensing.model import DonutAir
         from ..wavefront.atmosphere.atmosphere import Atmosphere
 
-        air = DonutAir(outer_scale=outer_scale, site=self.site)
+        air = DonutAir(outer_scale=outer_scale, site=self.site, shared=self.shared_air)
         if self.exposure_s is None:
             return air
         return replace(air, atmosphere=Atmosphere.from_site(air.layers(telescope), 0, exposure=self.exposure_s))
@@ -391,7 +402,7 @@ class OutputOptions:
         return kind
 
 
-def _require_within(option: str, value: float, bounds: tuple[float, float]) -> None:
-    """Raise a ConfigError for a length of an option [um] beyond its bounds."""
+def _require_within(option: str, value: float, bounds: tuple[float, float], unit: str = " um") -> None:
+    """Raise a ConfigError for a number of an option beyond its bounds."""
     if not bounds[0] <= value <= bounds[1]:
-        raise ConfigError(f"{option} = {value:g}: expected {bounds[0]:g} to {bounds[1]:g} um")
+        raise ConfigError(f"{option} = {value:g}: expected {bounds[0]:g} to {bounds[1]:g}{unit}")

@@ -34,6 +34,8 @@ class ExposureWavefront(Result):
         What each donut has beside the telescope's wavefront: `total` less the `zernikes` of the fit [m].
     air_rms : float
         Rms of the air's wavefront, Z4 to Z22 together, by the scatter of the donuts [m].
+    shared_air : float
+        Part of its variance that all donuts share, by their scatter, their residuals and the winds of the site.
     noise_scale : float
         Variance of the errors of the single fits over that claimed by them, by the scatter of the donuts.
     sides : SideAgreement or None
@@ -49,6 +51,7 @@ class ExposureWavefront(Result):
     total_covariance: np.ndarray
     own: np.ndarray
     air_rms: float
+    shared_air: float
     noise_scale: float
     sides: SideAgreement | None
     notices: tuple[str, ...]
@@ -65,6 +68,7 @@ class ExposureWavefront(Result):
             "total_error_nm": 1e9 * np.sqrt(np.diagonal(self.total_covariance, axis1=1, axis2=2)),
             "own_nm": 1e9 * self.own,
             "air_rms_nm": 1e9 * self.air_rms,
+            "shared_air": self.shared_air,
             "noise_scale": self.noise_scale,
             "sides": None
             if sides is None

@@ -30,7 +30,7 @@ from .moving_rims import FreeRims
 from .shared_rims import shared_rims
 from .sided_stars import FIELD_NOLL, SAME_STAR, field_basis, sided_stars
 from .sides import SideAgreement, pair_agreement
-from .star_errors import StarErrors, air_losses, air_of, exposure_air, star_errors
+from .star_errors import StarErrors, air_losses, air_of, exposure_air, further_strength, star_errors
 from .star_fitter import StarSolution
 from .terms import WavefrontTerms
 from .wavefront_fits import NOLL, FittedStar, FittedStars, UsableStars, WavefrontFit
@@ -126,9 +126,11 @@ class ExposureDonuts(WavefrontFit):
         further = np.concatenate([terms.further, np.setdiff1d(noll, terms.every)])
         variance = np.diag(air_of(instrument, int(noll[-1])))
         variance = min(exposure.air_rms, _MOST_AIR) ** 2 * variance[further - 4]
-        variance[: len(terms.further)] += 1.0 / terms.precision[len(terms.requested) :]
+        strength = further_strength(instrument, stars, exposure.air_rms)
+        of_telescope = np.where(terms.higher, strength, 1.0) * terms.figure
+        variance[: len(terms.further)] += of_telescope[len(terms.requested) :]
         precision = np.concatenate([np.zeros(len(terms.requested)), 1.0 / variance])
-        figure = np.concatenate([terms.figure, np.zeros(len(precision) - len(terms.figure))])
+        figure = np.concatenate([of_telescope, np.zeros(len(precision) - len(of_telescope))])
         losses = air_losses(instrument, stars)
         return WavefrontTerms(terms.requested, further, precision, figure, terms.air, air_losses=losses)
 
@@ -143,7 +145,6 @@ class ExposureDonuts(WavefrontFit):
         zernikes = np.array([star.solution.shared[:n] for star in usable.stars]).reshape(count, n)
         errors = [star_errors(instrument, star) for star in usable.stars]
         covariance = np.array([star.of_light for star in errors]).reshape(count, n, n)
-        figure = np.array([star.figure for star in errors]).reshape(count, n, n)
         if count < 2:
             return FittedStars(_results(usable, errors, zernikes, np.array([star.parts.total for star in errors])))
         behind = np.array([star.light.depth > 0.0 for star in usable.stars])
@@ -169,12 +170,15 @@ class ExposureDonuts(WavefrontFit):
             of_air = sizes.air**2 * air.shape
             sides = pair_agreement(zernikes[good], covariance[good], star[good], behind[good], sizes.noise, of_air)
             sides = sides or _sides_apart(without(observations, consistent.left_out), basis, air, behind)
+        strength = further_strength(instrument, usable.stars, hierarchy.sizes.air)
+        figure = np.array([star.figure + strength * star.higher for star in errors])
         exposure_result = ExposureWavefront(
             instrument.terms.requested,
             hierarchy.total,
             hierarchy.total_covariance + figure,
             hierarchy.total - hierarchy.telescope,
             0.0 if no_air else hierarchy.sizes.air,
+            hierarchy.sizes.shared,
             hierarchy.sizes.noise,
             sides,
             _notices(consistent, zernikes, usable.index, sides),

@@ -88,7 +88,9 @@ class ExposureAir:
     shape : ndarray, shape [n_noll, n_noll]
         Covariance of its terms over that of Z4 to Z22 together.
     shared : float
-        Part of it that all donuts of the exposure share.
+        Part of it that all donuts of the exposure share, about which that part lies.
+    shared_spread : float
+        Standard deviation of the logarithm of that part over the other; 0 where it is known.
     rms : float, optional
         Rms, Z4 to Z22 [m]; fitted by default.
     losses : ndarray, shape [n_rms], optional
@@ -97,6 +99,7 @@ class ExposureAir:
 
     shape: np.ndarray
     shared: float
+    shared_spread: float = 0.0
     rms: float | None = None
     losses: np.ndarray | None = None
 
@@ -174,6 +177,8 @@ class Sizes:
         Rms of linear field terms of all pupil terms alike, beside these [m].
     local : float
         Rms of what each star has of its own in the telescope's wavefront [m].
+    shared : float
+        Part of the air's variance that all donuts of an exposure share.
     """
 
     noise: float
@@ -182,12 +187,13 @@ class Sizes:
     fall: float
     bent: float
     local: float
+    shared: float
 
     @classmethod
     def of(cls, logarithms: np.ndarray) -> Self:
-        """Return those of logarithms; of the fall, that of its logarithm."""
-        noise, rms, linear, fall, bent, local = np.exp(logarithms)
-        return cls(noise, rms, linear, math.exp(fall), bent, local)
+        """Return those of logarithms; of the fall, that of its logarithm, of the shared part, over the other one."""
+        noise, rms, linear, fall, bent, local, shared = np.exp(logarithms)
+        return cls(noise, rms, linear, math.exp(fall), bent, local, shared / (1.0 + shared))
 
 
 @dataclass(frozen=True)
@@ -236,10 +242,12 @@ def fit_hierarchy(observations: Observations, basis: Basis, air: ExposureAir) ->
     """
     model = _Model(observations, basis, air)
     of_field = basis.variance is None
-    free = [True, air.rms is None, of_field, of_field, of_field, observations.repeated]
+    unknown = air.rms is None
+    free = [True, unknown, of_field, of_field, of_field, observations.repeated, unknown and air.shared_spread > 0.0]
     middle = _middle(observations, air)
     # Standard deviations of the logarithms of rms are half of those of variances.
-    spread = np.array([_SCALE_SPREAD, 0.5 * _WIDE, 0.5 * _WIDE, _FALL_SPREAD, 0.5 * _WIDE, 0.5 * _WIDE])
+    of_rms = 0.5 * _WIDE
+    spread = np.array([_SCALE_SPREAD, of_rms, of_rms, _FALL_SPREAD, of_rms, of_rms, air.shared_spread or 1.0])
     least, most = middle - 4.0 * spread, middle + 4.0 * spread
     most[1] = math.log(MOST_AIR)
     index = np.flatnonzero(free)
@@ -274,7 +282,8 @@ def chi2_by_the_others(observations: Observations, basis: Basis, air: ExposureAi
 def _middle(observations: Observations, air: ExposureAir) -> np.ndarray:
     """Return the logarithms of the sizes about which their priors lie."""
     local = _LOCAL_RMS if observations.repeated else 1e-3 * _UNIT
-    return np.log([1.0, air.rms or AIR_RMS, _LINEAR_RMS, math.log(_FALL), _BENT_RMS, local])
+    over_other = air.shared / (1.0 - air.shared)
+    return np.log([1.0, air.rms or AIR_RMS, _LINEAR_RMS, math.log(_FALL), _BENT_RMS, local, over_other])
 
 
 class _Model:
@@ -282,7 +291,6 @@ class _Model:
 
     def __init__(self, observations: Observations, basis: Basis, air: ExposureAir) -> None:
         self._basis, self._shape = basis, air.shape
-        self._shared = air.shared
         self._count, self._n = observations.zernikes.shape
         self._values = observations.zernikes / _UNIT
         self._noise = observations.covariance / _UNIT**2
@@ -300,7 +308,7 @@ class _Model:
         """Return the covariances of the wavefronts of stars but for the terms, [n_star, size n_noll, size n_noll]."""
         n_star, size = group.shape
         blocks = np.zeros((n_star, size, self._n, size, self._n))
-        above = (1.0 - self._shared) * (sizes.air / _UNIT) ** 2 * self._shape
+        above = (1.0 - sizes.shared) * (sizes.air / _UNIT) ** 2 * self._shape
         for k in range(size):
             blocks[:, k, :, k, :] = sizes.noise * self._noise[group[:, k]] + above
         blocks += self._local(sizes)[None, None, :, None, :]
@@ -316,7 +324,7 @@ class _Model:
         Degrees of freedom have units of their own; terms over the field are in metres.
         """
         variance = self._basis.variances(sizes)
-        ground = self._shared * (sizes.air / _UNIT) ** 2 * self._shape
+        ground = sizes.shared * (sizes.air / _UNIT) ** 2 * self._shape
         ground = ground + 1e-12 * np.trace(ground) * np.eye(self._n)
         precision = np.diag(np.concatenate([1.0 / variance, np.zeros(self._n_shared)]))
         first, logarithm = len(variance), float(np.log(variance).sum())
@@ -343,14 +351,14 @@ class _Model:
         return curvature, gradient, loss, inverses
 
     def loss(self, sizes: Sizes) -> tuple[float, np.ndarray]:
-        """Return twice the negative logarithm of the likelihood, the terms integrated over, and its slopes, [6].
+        """Return twice the negative logarithm of the likelihood, the terms integrated over, and its slopes, [7].
 
         These are by the logarithms of :meth:`Sizes.of`.
         """
         curvature, gradient, loss, inverses = self._normal(sizes)
         root = _root_of_inverse(curvature)
         if root is None:
-            return 1e30, np.zeros(6)
+            return 1e30, np.zeros(7)
         terms = root.T @ (root @ gradient)
         loss -= 2.0 * float(np.log(np.diag(root)).sum()) + float(gradient @ terms)
         return loss, self._slopes(sizes, inverses, root, terms)
@@ -361,8 +369,8 @@ class _Model:
         With the covariance V of wavefronts beside the terms u, of precision P, and K, Q and w of :meth:`_beside` they
         are :math:`\mathrm{tr}\,Q\,dV - w^T dV w + \mathrm{tr}\,(K^{-1} - P^{-1})\,dP + u^T dP u`.
         """
-        slopes = np.zeros(6)
-        above = 2.0 * (1.0 - self._shared) * (sizes.air / _UNIT) ** 2
+        slopes, of_above = np.zeros(7), 0.0
+        above = 2.0 * (1.0 - sizes.shared) * (sizes.air / _UNIT) ** 2
         for group, inverse in zip(self._groups, inverses, strict=True):
             n_star, size = group.shape
             precision, pull = self._beside(group, inverse, root, terms)
@@ -370,7 +378,7 @@ class _Model:
             for k in range(size):
                 of_donut = by_donuts[:, k, :, k]
                 slopes[0] += sizes.noise * float(np.vdot(of_donut, self._noise[group[:, k]]))
-                slopes[1] += above * float(np.vdot(of_donut.sum(axis=0), self._shape))
+                of_above += above * float(np.vdot(of_donut.sum(axis=0), self._shape))
             slopes[5] += 2.0 * float(np.vdot(by_donuts.sum(axis=(0, 1, 3)), self._local(sizes)))
         variance = self._basis.variances(sizes)
         first = len(variance)
@@ -378,7 +386,9 @@ class _Model:
         slopes[2:5] = self._basis.slopes(sizes) @ ((1.0 - squares / variance) / variance)
         of_ground = root[:, first:].T @ root[:, first:] + np.outer(terms[first:], terms[first:])
         ground = self._precision(sizes)[0][first:, first:]
-        slopes[1] += 2.0 * (self._n_shared - float(np.vdot(of_ground, ground)))
+        by_ground = 2.0 * (self._n_shared - float(np.vdot(of_ground, ground)))
+        slopes[1] = of_above + by_ground
+        slopes[6] = 0.5 * ((1.0 - sizes.shared) * by_ground - sizes.shared * of_above)
         return slopes
 
     def _beside(
@@ -424,7 +434,7 @@ class _Model:
         total = np.zeros_like(self._values)
         total_covariance = np.zeros_like(self._noise)
         local = self._local(sizes)
-        above = (1.0 - self._shared) * (sizes.air / _UNIT) ** 2 * self._shape
+        above = (1.0 - sizes.shared) * (sizes.air / _UNIT) ** 2 * self._shape
         for group, inverse in zip(self._groups, inverses, strict=True):
             n_star, size = group.shape
             design = self._design[group].reshape(n_star, size * self._n, -1)

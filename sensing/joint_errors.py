@@ -82,7 +82,7 @@ def joint_errors(
         of_air = np.mean([parts.air for parts in checked], axis=0)
         own = np.sum([gain @ of_air @ gain.T for gain in gains], axis=0)
         air = shared * common @ of_air @ common.T + (1.0 - shared) * own
-        figure = common @ np.mean([star_error.figure for star_error in errors], axis=0) @ common.T
+        figure = common @ np.mean([star_error.common for star_error in errors], axis=0) @ common.T
     return JointErrors(_by_residuals(instrument, stars, group, solution), air, figure)
 
 

@@ -25,7 +25,7 @@ from .pupil_cells import PupilCells
 from .response_slope import cells_with_response
 from .rim_outlines import concentric
 from .seeing import Seeing, StrengthPrior
-from .shared_air import shared_air
+from .shared_air import SHARED_SPREAD, shared_air
 from .stamps import Pixels
 from .terms import WavefrontTerms
 from .vignetting import MovableRim, cells_with_rims, movable_rims, shift_spread
@@ -166,8 +166,14 @@ class Instrument:
 
     @property
     def shared_air(self) -> float:
-        """Part of the variance of the air's mean wavefront that donuts of an exposure share."""
-        return shared_air(self.telescope, self.model.air.layers(self.telescope))
+        """Part of the variance of the air's mean wavefront that donuts of an exposure share, likely or known."""
+        air = self.model.air
+        return shared_air(self.telescope, air.layers(self.telescope)) if air.shared is None else float(air.shared)
+
+    @property
+    def shared_air_spread(self) -> float:
+        """Standard deviation of the logarithm of that part over the other; 0 where it is known."""
+        return SHARED_SPREAD if self.model.air.shared is None else 0.0
 
     @property
     def slope_spreads(self) -> np.ndarray:

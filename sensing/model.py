@@ -23,6 +23,8 @@ from .seeing import Seeing
 _SITE = "cerro_pachon"
 #: Largest seeing [rad]: no image of a star is as wide.
 _MOST_FWHM = 60.0 * ARCSEC
+#: Parts of the air that donuts may share.
+_SHARED = (0.01, 0.99)
 #: Sides of pixels of detectors [m].
 _PIXEL_SIDES = (1e-6, 1e-2)
 #: Largest defocus of an image [m].
@@ -56,8 +58,10 @@ class DonutAir:
         which no single donut tells from the telescope's, are added to ``covariance``. Three times the time; no joint
         fits.
     site : str or Site, optional
-        Site whose layers and winds say which part of the air all donuts of an exposure of unknown length share; that of
-        the telescope by default, else ``"cerro_pachon"``.
+        Site whose layers and winds say which part of the air all donuts of an exposure of unknown length share, about
+        which that of the exposure is fitted; that of the telescope by default, else ``"cerro_pachon"``.
+    shared : float, optional
+        That part of its variance, between 0.01 and 0.99, where it is known.
 
     Raises
     ------
@@ -71,8 +75,11 @@ class DonutAir:
     outer_scale: float = 25.0
     atmosphere: Atmosphere | None = None
     site: str | Site | None = None
+    shared: float | None = None
 
     def __post_init__(self) -> None:
+        if self.shared is not None:
+            require_within(self.shared, "shared", *_SHARED)
         if isinstance(self.site, str):
             object.__setattr__(self, "site", load_site(self.site))
         outer_scale_of(self.outer_scale)

@@ -24,9 +24,17 @@ RMS_LOGARITHMS = np.linspace(math.log(0.03), math.log(10.0), 30)
 _USUAL = math.log(1.1)
 _WIDE = 1.0
 #: Probability beforehand that there is next to none: images of telescopes in space, or made without air.
-_NONE = 0.2
-#: Parts of the power that telescopes are expected to have in further terms: of well figured ones there is next to none.
-_PARTS = (0.0, 0.2, 1.0)
+_NONE = 0.4
+#: Rms of the telescope's further terms over what is expected: of well figured ones there is next to nothing.
+_FIGURES = np.geomspace(0.1, 5.0, 8)
+#: Standard deviation of the logarithm of that ratio.
+_FIGURES_WIDE = 1.0
+#: Probability beforehand of the least one.
+_WELL_FIGURED = 0.1
+#: Loss of the logarithm of the likelihood from which on nothing is said of larger ones.
+_HOPELESS = 20.0
+#: Least variance by noise of an amplitude that fitted terms take up, over that by noise alone: derivatives are as good.
+_LEAST_NOISE = 5e-3
 #: Loss of the logarithm of the likelihood by a level that is fitted.
 _WORTH = 2.0
 #: Levels that are tried.
@@ -36,9 +44,10 @@ _FAINTEST = 1e-6
 
 
 class PatternSizes(NamedTuple):
-    """Strength of a field, surplus of the variance in all combinations alike, and losses of the rms of the field."""
+    """Strength of a field, that of the telescope's, surplus of the variance in all alike, and losses of both rms."""
 
     strength: float
+    figure: float
     level: float
     losses: np.ndarray
 
@@ -76,36 +85,50 @@ class Patterns:
         amplitudes = self.columns.T @ patterns
         return np.asarray(amplitudes @ amplitudes.T, dtype=np.float64)
 
-    def sizes(self, others: np.ndarray, expected: np.ndarray) -> PatternSizes:
-        """Return the strength of the field, the surplus of the variance in all combinations alike, and losses.
+    def sizes(self, others: np.ndarray, telescope: np.ndarray, fitted: np.ndarray) -> PatternSizes:
+        """Return the strengths of the field and of the telescope's, the surplus of the variance in all, and losses.
 
-        Strength and surplus are means over all rms of the field, without a level and with the best one, for all of what
-        is expected: one donut hardly tells less of it from air. Losses, which several tell together, are over parts of
-        it, too: twice the negative logarithm of the likelihood at :data:`RMS_LOGARITHMS`.
+        They are means over all rms of both fields, without a level and with the best one. Losses, which several donuts
+        tell together, are twice the negative logarithm of the likelihood, by the telescope's rms and at
+        :data:`RMS_LOGARITHMS`.
 
         Parameters
         ----------
         others : ndarray, shape [m, m]
             Power of other fields in the amplitudes.
-        expected : ndarray, shape [m, m]
-            The same of what a telescope is expected to have, or less.
+        telescope : ndarray, shape [m, m]
+            The same of what telescopes are expected to have.
+        fitted : ndarray, shape [m, m]
+            What the priors of fitted terms among it have of the unit variance of the amplitudes.
         """
         strengths = np.exp(2.0 * RMS_LOGARITHMS)
         if not len(self.variances):
-            return PatternSizes(0.0, 0.0, np.zeros(len(strengths)))
-        trials = [self._losses(others + share * expected) for share in _PARTS]
-        of_all, surplus = trials[-1]
-        prior = np.exp(-0.5 * ((RMS_LOGARITHMS - _USUAL) / _WIDE) ** 2)
-        prior[0] += _NONE / (1.0 - _NONE) * prior.sum()
-        posterior = prior * np.exp(of_all.min() - of_all)
+            return PatternSizes(0.0, 1.0, 0.0, np.zeros((1, len(strengths))))
+        values, vectors = np.linalg.eigh(np.eye(len(fitted)) - fitted)
+        noise = others + vectors * np.maximum(values, _LEAST_NOISE) @ vectors.T
+        figures = _FIGURES if telescope.any() else np.ones(1)
+        losses = np.full((len(figures), 2, len(strengths)), np.inf)
+        surplus = np.zeros_like(losses)
+        for k, size in enumerate(figures):
+            losses[k], surplus[k] = self._losses(noise + size**2 * telescope)
+            if losses[k].min() > losses.min() + _HOPELESS:
+                break
+        of_rms = _prior((RMS_LOGARITHMS - _USUAL) / _WIDE, _NONE)
+        posterior = _figure_prior(len(figures))[:, None, None] * of_rms * np.exp(losses.min() - losses)
         posterior /= posterior.sum()
-        losses = -2.0 * logsumexp([-of_trial for of_trial, _ in trials], axis=(0, 1))
-        return PatternSizes(float((posterior * strengths).sum()), float((posterior * surplus).sum()), losses)
+        return PatternSizes(
+            float((posterior * strengths).sum()),
+            float((posterior.sum(axis=(1, 2)) * figures**2).sum()),
+            float((posterior * surplus).sum()),
+            -2.0 * logsumexp(-losses, axis=1),
+        )
 
-    def _losses(self, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return losses without and with a level by the rms of the field, and the level, each [2, n_rms]."""
-        count, strengths = len(self.variances), np.exp(2.0 * RMS_LOGARITHMS)
-        base = np.eye(count) + power
+    def _losses(self, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return losses without and with a level by the rms of the field, and the level, each [2, n_rms].
+
+        ``base`` is the covariance of the amplitudes without the field.
+        """
+        strengths = np.exp(2.0 * RMS_LOGARITHMS)
         variances, vectors = eigh(np.diag(self.variances), base)
         energies = (vectors.T @ self.amplitudes) ** 2
         # Up to beyond the logarithm of their mean square, where the field lowers the level.
@@ -116,3 +139,30 @@ class Patterns:
         # What lies far out is part of the level.
         surplus = np.maximum((energies - of_field).mean(axis=1) - 1.0, 0.0)
         return np.stack([losses[0], losses[1:].min(axis=0) + _WORTH]), np.stack([np.zeros(len(strengths)), surplus])
+
+
+def losses_of_field(losses: np.ndarray) -> np.ndarray:
+    """Return losses by the rms of the field alone, [n_rms], of those by the telescope's, too, [n_figure, n_rms]."""
+    prior = _figure_prior(len(losses))
+    return np.asarray(-2.0 * logsumexp(-0.5 * losses, axis=0, b=prior[:, None]))
+
+
+def figure_strength(losses: np.ndarray, rms: float) -> float:
+    """Return the mean strength of what the telescope has, with a field of an rms, by losses [n_figure, n_rms]."""
+    if len(losses) == 1:
+        return 1.0
+    at_rms = np.array([np.interp(math.log(rms), RMS_LOGARITHMS, row) for row in losses])
+    return float(np.average(_FIGURES**2, weights=_figure_prior(len(losses)) * np.exp(0.5 * (at_rms.min() - at_rms))))
+
+
+def _figure_prior(count: int) -> np.ndarray:
+    """Return the prior of the rms of the telescope's further terms, of unit sum; of one alone, 1."""
+    return _prior(np.log(_FIGURES) / _FIGURES_WIDE, _WELL_FIGURED) if count > 1 else np.ones(1)
+
+
+def _prior(deviations: np.ndarray, of_first: float) -> np.ndarray:
+    """Return a normal prior by deviations, and the first one more probable by so much, of unit sum."""
+    prior = np.exp(-0.5 * deviations**2)
+    prior *= (1.0 - of_first) / prior.sum()
+    prior[0] += of_first
+    return np.asarray(prior)

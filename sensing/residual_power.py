@@ -26,10 +26,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.linalg import cho_factor, solve_triangular, toeplitz
+from scipy.linalg import solve_triangular, toeplitz
 from scipy.optimize import nnls
 
 from .likelihood import Linearized
@@ -66,19 +66,33 @@ class ResidualPower:
         Power of what the model lacks, in combinations of the unknowns that are independent of unit variance.
     strength : float
         Strength of the field of patterns, of which the power has nothing.
-    losses : ndarray, shape [n_rms], optional
-        Losses of the residuals by the rms of that field, at :data:`~pachon.sensing.residual_patterns.RMS_LOGARITHMS`.
+    figure : float
+        Strength of what the telescope is expected to have in them.
+    losses : ndarray, shape [n_figure, n_rms], optional
+        Losses of the residuals by the rms of what the telescope has, and of that field, of
+        :mod:`~pachon.sensing.residual_patterns`.
     """
 
     root: np.ndarray
     power: np.ndarray
     strength: float = 0.0
+    figure: float = 1.0
     losses: np.ndarray | None = None
 
     @property
     def covariance(self) -> np.ndarray:
         """Covariance of the unknowns by what the model lacks, shape [n, n]."""
         return np.asarray(self.root @ self.power @ self.root.T)
+
+
+class TelescopePatterns(NamedTuple):
+    """Patterns of the telescope's further terms over the noise: of the rms expected, [n_pixel, k], and as priors have.
+
+    Those of priors are of the terms that are fitted, [n_pixel, l].
+    """
+
+    expected: np.ndarray
+    fitted: np.ndarray
 
 
 class Field(Protocol):
@@ -101,7 +115,7 @@ def residual_power(
     covariance: np.ndarray,
     resolution: float,
     patterns: np.ndarray | None = None,
-    expected: np.ndarray | None = None,
+    telescope: TelescopePatterns | None = None,
     prior_gradient: np.ndarray | None = None,
 ) -> ResidualPower:
     """Return what the residuals of a donut say about the errors of its unknowns.
@@ -116,8 +130,8 @@ def residual_power(
         Width of the finest detail of the image [pixels].
     patterns : ndarray, shape [n_pixel, m], optional
         Patterns over the noise, whose squares are the covariance of a further field.
-    expected : ndarray, shape [n_pixel, m], optional
-        The same of what the model is known to lack, within the span of the patterns.
+    telescope : TelescopePatterns, optional
+        The same of what the telescope is expected to have, within the span of the patterns.
     prior_gradient : ndarray, shape [n], optional
         Precisions of the priors times the deviations of the unknowns from their means: residuals are then those at the
         end of the last step of a search, which stops a part of a standard deviation short of it.
@@ -133,7 +147,8 @@ def residual_power(
         pulls = pulls - columns @ (columns.T @ pulls - root.T @ prior_gradient).astype(np.float32)
     beside = None if patterns is None else Patterns.of(squares.of(patterns), columns, pulls)
     if beside is not None:
-        pulls, columns = pulls - beside.columns @ beside.amplitudes, np.hstack([columns, beside.columns])
+        pulls = pulls - beside.columns @ beside.amplitudes.astype(np.float32)
+        columns = np.hstack([columns, beside.columns])
     n = len(root)
     residuals = _Residuals(squares.used, pulls, columns, _fields(linearized, squares, resolution))
     if max(residuals.excess(name) for name in _SCREENED) < _SIGNIFICANT:
@@ -142,9 +157,12 @@ def residual_power(
         inner, of_patterns = residuals.power(n)
     if beside is None:
         return ResidualPower(root, inner)
-    of_telescope = np.zeros_like(of_patterns) if expected is None else beside.power_of(squares.of(expected))
-    sizes = beside.sizes(of_patterns, of_telescope)
-    return ResidualPower(root, inner + sizes.level * (np.eye(n) + inner), sizes.strength, sizes.losses)
+    of_telescope, fitted = np.zeros((2, *of_patterns.shape))
+    if telescope is not None:
+        of_telescope = beside.power_of(squares.of(telescope.expected))
+        fitted = beside.power_of(squares.of(telescope.fitted))
+    sizes = beside.sizes(of_patterns, of_telescope, fitted)
+    return ResidualPower(root, inner + sizes.level * (np.eye(n) + inner), sizes.strength, sizes.figure, sizes.losses)
 
 
 class _Squares:
@@ -336,9 +354,9 @@ class StationaryField:
             return other.product(self)
         # The product of two Gaussians is one.
         length = 1.0 / math.hypot(1.0 / self._length, 1.0 / other._length)
-        rows, along = (_gaussian(n, length) for n in self._used.shape)
         if self._even and other._even:
-            return float(rows.sum() * along.sum())
+            return math.prod(_sum_of_gaussian(n, length) for n in self._used.shape)
+        rows, along = (_gaussian(n, length) for n in self._used.shape)
         amplitude = self._amplitude * other._amplitude
         return float((amplitude * (rows @ amplitude @ along)).sum())
 
@@ -350,6 +368,12 @@ def _gaussian(count: int, length: float) -> np.ndarray:
     matrix = np.asarray(toeplitz(np.where(correlation > _UNCORRELATED, correlation, 0.0)))
     matrix.flags.writeable = False
     return matrix
+
+
+@lru_cache(maxsize=256)
+def _sum_of_gaussian(count: int, length: float) -> float:
+    """Return the sum of the Gaussian correlations of places on a line, of a length [pixels]."""
+    return float(_gaussian(count, length).sum())
 
 
 def _fields(linearized: Linearized, squares: _Squares, resolution: float) -> dict[str, Field]:
@@ -397,9 +421,9 @@ def _strengths(products: np.ndarray, surplus: np.ndarray, least: np.ndarray) -> 
     scale = np.sqrt(np.diag(products))
     normalized = products / np.outer(scale, scale)
     normalized[np.diag_indices_from(normalized)] += _RIDGE
-    factor = np.tril(cho_factor(normalized, lower=True)[0])
-    beyond = solve_triangular(factor, (surplus - products @ least) / scale, lower=True)
-    strengths = solve_triangular(factor, beyond, lower=True, trans="T")
+    factor = np.linalg.cholesky(normalized)
+    beyond = solve_triangular(factor, (surplus - products @ least) / scale, lower=True, check_finite=False)
+    strengths = solve_triangular(factor, beyond, lower=True, trans="T", check_finite=False)
     if strengths.min() < 0.0:
         strengths, _ = nnls(factor.T, beyond)
     return np.asarray(strengths / scale + least)

@@ -17,8 +17,8 @@ from .hierarchy import ExposureAir
 from .image_model import STRENGTH
 from .light import Instrument
 from .likelihood import Linearized, linearized, wavefront_columns
-from .residual_patterns import AIR_UNIT
-from .residual_power import residual_power
+from .residual_patterns import AIR_UNIT, figure_strength, losses_of_field
+from .residual_power import TelescopePatterns, residual_power
 from .star_fitter import StarSolution
 
 #: Terms up to the eleventh radial degree: what the mean wavefront of the air has beyond is lost in the seeing.
@@ -93,18 +93,29 @@ class StarErrors:
     of_light : ndarray, shape [n_noll, n_noll]
         Covariance of the wavefront of its light, the air's low terms among it, but for what stars have in common.
     figure : ndarray, shape [n_noll, n_noll]
-        What stars have in common: the telescope's terms beside those asked for, fitted with a prior or not, and the
-        accuracy of the model.
-    air_losses : ndarray, shape [n_rms], optional
+        What stars have in common but for higher orders: the telescope's terms beside those asked for, fitted with a
+        prior, and the accuracy of the model.
+    higher : ndarray, shape [n_noll, n_noll]
+        The same of the telescope's terms of higher orders as they are expected, fitted or not.
+    air_losses : ndarray, shape [n_figure, n_rms], optional
         What the residuals say of the air: twice the negative logarithm of the likelihood of its rms, at
-        :data:`~pachon.sensing.residual_patterns.RMS_LOGARITHMS` in units of 100 nm.
+        :data:`~pachon.sensing.residual_patterns.RMS_LOGARITHMS` in units of 100 nm, for some of the telescope's.
+    further : float
+        Variance of the telescope's terms of higher orders over the expected one, as the residuals say.
     """
 
     covariance: np.ndarray
     parts: ErrorParts
     of_light: np.ndarray
     figure: np.ndarray
+    higher: np.ndarray
     air_losses: np.ndarray | None = None
+    further: float = 1.0
+
+    @property
+    def common(self) -> np.ndarray:
+        """What stars have in common, shape [n_noll, n_noll]."""
+        return np.asarray(self.figure + self.further * self.higher)
 
 
 def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
@@ -115,8 +126,8 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     n_star, n = len(solution.stars[0]), len(terms.requested)
     wavefront = slice(n_star, n_star + n)
     photons, air = solution.covariance, terms.air
-    figure, by_prior, speckled = np.zeros((3, n, n))
-    air_losses = None
+    unfitted, higher, by_prior, speckled = np.zeros((4, n, n))
+    air_losses, further = None, 1.0
     residuals, lacking = np.zeros_like(photons), solution.star_covariance(0).copy()
     point = linearized(star.stamp, solution.stars[0], solution.waves[0])
     if point is not None and len(solution.shared):
@@ -127,16 +138,19 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
             photons,
             resolution(instrument, star),
             beside.patterns,
-            beside.unfitted,
+            beside.telescope,
             precision * deviation,
         )
-        residuals, air_losses = power.covariance, power.losses
+        residuals, air_losses, further = power.covariance, power.losses, power.figure
+        if instrument.model.rims.size > 0.0:
+            # Rims of uncertain radii take up what further terms would show.
+            further = max(further, 1.0)
         lacking += residuals[:n_star, :n_star]
-        figure = beside.figure(photons)[wavefront, wavefront]
+        unfitted = beside.figure(photons)[wavefront, wavefront]
         # What a prior about zero takes from the telescope's further terms goes into those asked for.
         pulled = photons[wavefront, n_star : n_star + len(terms.figure)] * terms.precision * np.sqrt(terms.figure)
         pulled *= solution.prior_weight
-        by_prior = pulled @ pulled.T
+        by_prior, higher = pulled @ pulled.T, pulled[:, terms.higher] @ pulled[:, terms.higher].T
         known_air = instrument.model.air.atmosphere is not None
         strength = 0.0 if known_air else min(power.strength, _most_air(instrument, float(solution.stars[0][STRENGTH])))
         if strength > 0.0:
@@ -144,14 +158,16 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
             lacking, air = lacking + speckles[:n_star, :n_star], air + turbulence[wavefront, wavefront]
             speckled = speckles[wavefront, wavefront]
     accuracy, of_residuals = model_floor(solution.shared[:n]), residuals[wavefront, wavefront] + by_rivals(star, n)
-    # Priors that weigh more than they say leave more of what they hold than the inverse of the curvature has.
-    of_noise = photons[wavefront, wavefront] + (1.0 - 1.0 / solution.prior_weight) * by_prior
+    # The inverse of the curvature has what priors hold of terms as large as these say, for their weight.
+    held = by_prior + (further - 1.0) * higher
+    of_noise = photons[wavefront, wavefront] + held - by_prior / solution.prior_weight
     if star.steps is not None:
         lacking += star.steps.covariance[:n_star, :n_star]
         of_noise = of_noise + star.steps.covariance[wavefront, wavefront]
-    parts = ErrorParts.of(of_noise, of_residuals, air, figure + accuracy)
-    of_light = parts.photons - by_prior + parts.residuals + speckled
-    return StarErrors(lacking, parts, of_light, figure + by_prior + accuracy, air_losses)
+    parts = ErrorParts.of(of_noise, of_residuals, air, further * unfitted + accuracy)
+    of_light = parts.photons - held + parts.residuals + speckled
+    figure = by_prior - higher + accuracy
+    return StarErrors(lacking, parts, of_light, figure, higher + unfitted, air_losses, further)
 
 
 def by_rivals(star: StarSolution, n: int) -> np.ndarray:
@@ -202,7 +218,7 @@ def air_of_zernikes(instrument: Instrument) -> np.ndarray:
 
 def exposure_air(instrument: Instrument, rms: float | None = None, losses: np.ndarray | None = None) -> ExposureAir:
     """Return the mean wavefront of an exposure, of an rms of Z4 to Z22 [m] if it is known, with what residuals say."""
-    return ExposureAir(air_of_zernikes(instrument), instrument.shared_air, rms, losses)
+    return ExposureAir(air_of_zernikes(instrument), instrument.shared_air, instrument.shared_air_spread, rms, losses)
 
 
 def air_losses(instrument: Instrument, stars: Sequence[StarSolution]) -> np.ndarray | None:
@@ -217,7 +233,17 @@ def air_losses(instrument: Instrument, stars: Sequence[StarSolution]) -> np.ndar
     losses = [values for values in of_stars if values is not None]
     # Squares of two amplitudes are correlated as the square of the correlation of these.
     alike = 1.0 + (len(losses) - 1) * instrument.shared_air**2
-    return _TRUST / alike * np.sum(losses, axis=0) if losses else None
+    return losses_of_field(_TRUST / alike * np.sum(np.broadcast_arrays(*losses), axis=0)) if losses else None
+
+
+def further_strength(instrument: Instrument, stars: Sequence[StarSolution], air_rms: float) -> float:
+    """Return the variance of the telescope's terms of higher orders over the expected one, as the residuals say.
+
+    All stars have the same, and say no more of it than one does; ``air_rms`` is that of the exposure's air [m].
+    """
+    losses = [errors.air_losses for errors in (star_errors(instrument, star) for star in stars)]
+    of_stars = [values for values in losses if values is not None]
+    return figure_strength(np.mean(np.broadcast_arrays(*of_stars), axis=0), air_rms / AIR_UNIT) if of_stars else 1.0
 
 
 def air_of(instrument: Instrument, last: int) -> np.ndarray:
@@ -282,6 +308,15 @@ class _TermsBeside:
         """Changes of the image over the noise by terms that are not fitted, of the rms that telescopes have."""
         columns = self._columns[:, len(self._instrument.terms.further) :]
         return columns * self._instrument.terms.spreads_beyond(self._beyond).astype(np.float32)
+
+    @cached_property
+    def telescope(self) -> TelescopePatterns:
+        """Changes of the image over the noise by the telescope's further terms of higher orders."""
+        terms, weight = self._instrument.terms, self._star.solution.prior_weight
+        further = slice(len(terms.requested), None)
+        spreads = np.sqrt(np.where(terms.higher, terms.figure, 0.0))[further].astype(np.float32)
+        fitted = self._columns[:, : len(spreads)] * spreads
+        return TelescopePatterns(np.hstack([fitted, self.unfitted]), fitted / np.float32(math.sqrt(weight)))
 
     def figure(self, covariance: np.ndarray) -> np.ndarray:
         """Return the covariance of the unknowns by terms that are not fitted."""

@@ -87,6 +87,11 @@ class WavefrontTerms:
         return np.concatenate([self.requested, self.further])
 
     @property
+    def higher(self) -> np.ndarray:
+        """Which terms are fitted with the rms of the next radial degree, of which the images say how large it is."""
+        return (self.figure > 0.0) & (self.figure == self.higher_order**2)
+
+    @property
     def first_low(self) -> int:
         """Number of the first terms up to Z22 that telescopes have much of, before any other."""
         low = (self.every <= _LOW_TERMS) & (self.precision < _MUCH**-2.0)

@@ -155,6 +155,7 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
             ["plain.fits", "--defocus-um", "nan", "--field-deg", "0,0"],
             "--defocus-um = nan: expected -100000 to 100000 um",
         ),
+        (["plain.fits", "--shared-air", "1", "--field-deg", "0,0"], "--shared-air = 1: expected 0.01 to 0.99"),
         (["plain.fits", "--pixel-um", "0", "--field-deg", "0,0"], "--pixel-um = 0: expected 1 to 10000 um"),
         (["plain.fits", "-o", "no_folder/a.ecsv", "--field-deg", "0,0"], "cannot write no_folder/a.ecsv"),
         (["plain.fits", "./plain.fits", "--field-deg", "0,0"], "plain.fits: given twice"),

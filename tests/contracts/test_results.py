@@ -50,7 +50,7 @@ def _made_by_hand(made):
         pachon.FocalPlanePsf(None, three == 0, shapes, {}, np.nan, (), 3e-6, 1e-6, 21),
         dataclasses.replace(made.ccd_image, objects=dict.fromkeys(OBJECT_COLUMNS, three)),
         pachon.sensing.ExposureWavefront(
-            np.arange(4, 7), np.eye(3), np.ones((3, 3, 3)), np.eye(3), 1e-7, 1.0, None, ("a",)
+            np.arange(4, 7), np.eye(3), np.ones((3, 3, 3)), np.eye(3), 1e-7, 0.8, 1.0, None, ("a",)
         ),
         pachon.sensing.FreedomEstimate(made.dofs, three[:1], np.eye(1), np.ones(1)),
         pachon.sensing.ObservatoryZernikes(

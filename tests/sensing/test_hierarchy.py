@@ -156,6 +156,21 @@ def test_sizes_are_those_drawn():
     assert sizes.noise == pytest.approx(2.0, rel=0.2)
 
 
+@pytest.mark.parametrize("part", [0.3, 0.9])
+def test_exposures_say_which_part_of_the_air_donuts_share(part):
+    """Where residuals say how much air there is, scatter says what of it donuts do not share."""
+    rng = np.random.default_rng(2)
+    places, zeros = places_of(rng, 20), np.zeros(20, dtype=int)
+    air = 120e-9 * np.sqrt((1.0 - part) / (1.0 - GROUND))
+    observations, _, _ = drawn(rng, places, star=np.arange(20), exposure=zeros, air=air)
+    losses = 200.0 * np.log(RMS / 120e-9) ** 2
+    known, free = (ExposureAir(shape(), 0.8, spread, losses=losses) for spread in (0.0, 1.5))
+    sizes = [fit_hierarchy(observations, field_basis(places), of_air).sizes for of_air in (known, free)]
+    assert sizes[0].shared == pytest.approx(0.8)
+    assert sizes[1].shared == pytest.approx(part, abs=0.15)
+    assert sizes[1].air == pytest.approx(120e-9, rel=0.15)
+
+
 def test_donuts_of_one_star_stand_within_a_distance_or_have_one_name():
     fields = np.array([[0.0, 0.0], [1e-3, 0.0], [1e-5, 0.0], [1e-3, 1e-5]])
     assert star_numbers(fields, 1e-4).tolist() == [0, 1, 0, 1]
@@ -171,12 +186,12 @@ def test_slopes_of_the_loss_are_those_of_differences(donuts_of_a_star):
     exposure = np.arange(len(star)) % donuts_of_a_star
     observations, _, _ = drawn(rng, places, star=star, exposure=exposure, air=60e-9, local=20e-9)
     model = _Model(observations, field_basis(places), ExposureAir(shape(), GROUND))
-    at, step = np.log([1.3, 90e-9, 120e-9, np.log(3.5), 6e-9, 12e-9]), 1e-4
+    at, step = np.log([1.3, 90e-9, 120e-9, np.log(3.5), 6e-9, 12e-9, 1.5]), 1e-4
 
     def loss(logarithms):
         return model.loss(Sizes.of(logarithms))[0]
 
-    differences = [(loss(at + unit) - loss(at - unit)) / (2.0 * step) for unit in step * np.eye(6)]
+    differences = [(loss(at + unit) - loss(at - unit)) / (2.0 * step) for unit in step * np.eye(7)]
     slopes = model.loss(Sizes.of(at))[1]
     assert np.abs(slopes).min() > 0.01
     # Second-order differences at this step are off by 1e-7 of the larger slopes.

@@ -44,3 +44,21 @@ def test_site_of_the_fit_is_that_of_the_telescope_unless_it_is_given():
     assert pachon.DonutAir(site="cerro_pachon").layers(telescope) == load_site("cerro_pachon")
     with pytest.raises(pachon.errors.UnknownNameError, match="nowhere"):
         pachon.DonutAir(site="nowhere")
+
+
+@pytest.mark.long
+def test_a_part_that_is_known_is_taken():
+    fields = np.deg2rad([[0.2, 0.1], [-0.4, 0.3]])
+    telescope = pachon.load_telescope("lsst_v3.3_r").perturbed("Detector", shift=(0.0, 0.0, 0.8e-3))
+    seen = pachon.DonutModel(air=pachon.DonutAir(fwhm=np.deg2rad(0.7 / 3600)))
+    drawn = pachon.draw_donuts(telescope, fields, 622e-9, electrons=1e6, sky=100.0, model=seen)
+    options = {"sky_variance": drawn.sky_variance, "fit": pachon.sensing.ExposureDonuts(), "threads": 1}
+    model = pachon.DonutModel(air=pachon.DonutAir(shared=0.3), diffraction=False)
+    fit = pachon.fit_donuts(telescope, drawn.images, fields, 622e-9, model=model, **options)
+    assert fit.exposure.shared_air == pytest.approx(0.3, abs=1e-9)
+
+
+@pytest.mark.parametrize("shared", [0.0, 1.0, np.nan])
+def test_a_part_of_nothing_or_all_is_refused(shared):
+    with pytest.raises(pachon.errors.DomainError, match="shared"):
+        pachon.DonutAir(shared=shared)
