@@ -44,7 +44,7 @@ def object_shears(
     Raises
     ------
     DomainError
-        If no pixel has a variance, or a PSF is too wide.
+        If no pixel has a variance, a PSF is too wide, or all peaks are near masked pixels.
     """
     places = cell_middles(image.image.shape)
     peaks = detect_shear(

@@ -22,6 +22,7 @@ from ..measure.shapes import measure_shapes
 from ..measure.star_flux import with_unit_flux
 from ..measure.star_selection import flag_stars
 from ..reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
+from ..reconstruction.own_stars.masked_stars import fill_by_median_star
 from ..reconstruction.psf_model.model import PsfModel
 from ..reconstruction.psf_model.pixels import Pixels
 from ..reconstruction.psf_model.polynomial_fit import Polynomial
@@ -136,7 +137,8 @@ def _usual_radius(objects: DetectedObjects, min_snr: float) -> float:
 
 def _single_stars(image: CcdImage, stars: StarSelection) -> StarSelection:
     """Return the selected stars whose stamps show no neighbour, cosmic ray or saturated core."""
-    return stars.without(flag_stars(stars.stamps, _noise_about(image, stars), gain=image.gain).flags != 0)
+    stamps = stars.stamps if stars.masks is None else np.where(stars.masks, np.nan, stars.stamps)
+    return stars.without(flag_stars(stamps, _noise_about(image, stars), gain=image.gain).flags != 0)
 
 
 def _noise_about(image: CcdImage, stars: StarSelection) -> np.ndarray:
@@ -262,14 +264,17 @@ def focal_plane_stars(
 
 def _ccd_stars(image: CcdImage, stars: StarSelection, weight_fwhm: float) -> CcdStars:
     """Return the selected stars of an image with the noise of its sky."""
-    stamps, flux = with_unit_flux(stars.stamps)
+    observed = stars.stamps
+    if stars.masks is not None:
+        observed = fill_by_median_star(observed, stars.masks, image.pixel_scale, weight_fwhm).images
+    stamps, flux = with_unit_flux(observed)
     shapes = measure_shapes(stamps, image.pixel_scale, weight_fwhm)
     level = sky_variance(image) * image.gain**2
     x, y = image.pixels_of_ccd(stars.positions).T
     good = np.isfinite(flux) & (shapes.flags == 0)
     values = np.stack([shapes.e1, shapes.e2, np.log(np.where(good, shapes.size, 1.0))], axis=1)
     good[good] = regular_shapes(values[good], stars.snr[good], stars.positions[good])
-    return CcdStars(image.name, x, y, shapes, flux * image.gain, (level, 0.0), stamps, good)
+    return CcdStars(image.name, x, y, shapes, flux * image.gain, (level, 0.0), stamps, good, stars.masks)
 
 
 def regular_shapes(values: np.ndarray, snr: np.ndarray, positions: np.ndarray) -> np.ndarray:

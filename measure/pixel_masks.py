@@ -29,8 +29,8 @@ _FLAT = 3
 _EQUAL_BY_SYMMETRY = 4
 # Fewest rows of theirs: of whole numbers with a noise of 1 so many agree by chance once in ten thousand stamps.
 _COPIED_LENGTH = 12
-# Standard deviation of the weights of good neighbours [pixel], about the width of a star.
-_NEIGHBOURHOOD = 1.5
+#: Standard deviation of the weights of good neighbours [pixel], about the width of a star.
+NEIGHBOURHOOD = 1.5
 # Part of a bad pixel from which on the place opposite is no better.
 _OVERLAP = 0.1
 # Least sum of these weights: a bad pixel without any near starts as sky.
@@ -225,7 +225,7 @@ def fill_symmetric(images: np.ndarray, bad: np.ndarray, x: Any = 0.0, y: Any = 0
 
 def _near_means(images: np.ndarray, bad: np.ndarray) -> np.ndarray:
     """Return images [n, ny, nx] whose bad pixels hold the mean of good ones near them, zero where there are none."""
-    along_both = (0.0, _NEIGHBOURHOOD, _NEIGHBOURHOOD)
+    along_both = (0.0, NEIGHBOURHOOD, NEIGHBOURHOOD)
     weight, light = (
         ndimage.gaussian_filter(values, along_both, mode="constant")
         for values in ((~bad).astype(np.float64), np.where(bad, 0.0, images))

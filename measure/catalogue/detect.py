@@ -19,6 +19,7 @@ from ..shapes import fwhm
 from .cutouts import cut_out
 from .objects import DetectedObjects, ObjectFlag
 from .pixel_checks import check_pixels
+from .scattered_pixels import fill_objects, fill_scattered
 
 # Radius over which the Kron radius is averaged, as in SExtractor [rms axes].
 _KRON_LIMIT = 6.0
@@ -66,7 +67,8 @@ def detect_objects(
     variance : array
         Of the pixels, in the square of that unit, [ny, nx].
     mask : array of int, optional
-        [ny, nx] bits. Pixels with any bit other than those of `saturated` are left out.
+        [ny, nx] bits. Pixels with any bit other than those of `saturated` are left out; among mostly good ones, as
+        scattered bad pixels and columns are, they are filled by the light of their object or the mean of neighbours.
     saturated : int
         Bits of saturated pixels, which belong to their object and flag it.
     threshold : float
@@ -116,14 +118,29 @@ def detect_objects(
                 sky = np.ascontiguousarray(dithered(data, ignored).values)
                 level = sep.Background(sky, mask=ignored, bw=background_size, bh=background_size).back()
                 data = np.where(ignored, 0.0, data - level)
-            sep_objects, segmentation = sep.extract(data, var=variances, mask=ignored, segmentation_map=True, **options)
+            scattered = without_core = None
+            if ignored.any():
+                data, variances, scattered = fill_scattered(data, variances, ignored)
+                ignored = ignored & ~scattered
+            options |= {"var": variances, "mask": ignored, "segmentation_map": True}
+            sep_objects, segmentation = sep.extract(data, **options)
+            if scattered is not None and segmentation[scattered].any():
+                bad = scattered | ignored
+                data, unsure, lost = fill_objects(data, bad, segmentation, sep_objects["x"], sep_objects["y"])
+                variances += unsure
+                without_core = np.append(False, lost)[segmentation]
+                sep_objects, segmentation = sep.extract(data, **options)
         except Exception as error:  # SEP raises Exception itself
             raise DomainError(f"SEP: {' '.join(str(error).split())}") from None
     if not len(sep_objects):
         raise DomainError(
             f"no objects: expected {min_area} connected pixels above {threshold:g} standard deviations of the noise"
         )
-    return _measure_objects(data, variances, ignored, (bits & saturated) != 0, sep_objects, segmentation, level)
+    objects = _measure_objects(data, variances, ignored, (bits & saturated) != 0, sep_objects, segmentation, level)
+    if without_core is not None:
+        rows, columns = (np.rint(at).astype(np.int64) for at in (objects.y, objects.x))
+        objects.flags[without_core[rows, columns]] |= ObjectFlag.MASKED
+    return objects
 
 
 def _sep_options(

@@ -9,11 +9,10 @@ from ...core.errors import DomainError
 from ...core.number_text import counted
 from ...core.units import real_array
 from ..pixel_masks import bad_pixels
-from .cutouts import cut_out
 from .matching import match_positions
 from .objects import DetectedObjects, ObjectFlag
 from .pixel_checks import flagged
-from .star_locus import ALIKE, STAMP_SIDE, StarCut, StarSelection, median_and_sigma
+from .star_locus import ALIKE, STAMP_SIDE, StarCut, StarSelection, median_and_sigma, spoilt_stars
 
 #: Largest distance of an object from a named star [pixel].
 MATCH = 3.0
@@ -42,7 +41,7 @@ def named_stars(
 ) -> StarSelection:
     """Select the objects at the positions of a catalogue of stars, and cut out their stamps.
 
-    Those that are saturated, at the edge or with masked pixels are left out, and faint ones; sizes and shapes are not
+    Those that are saturated, at the edge or mostly masked are left out, and faint ones; sizes and shapes are not
     compared.
 
     Parameters
@@ -58,7 +57,7 @@ def named_stars(
     size : int
         Side of the stamps, odd [pixel].
     mask : array, optional
-        [ny, nx], not zero for pixels that no stamp may hold.
+        [ny, nx], not zero for pixels without weight.
 
     Raises
     ------
@@ -132,7 +131,7 @@ def _left_out_text(cuts: np.ndarray, min_snr: float) -> str:
     """Return the words for objects among which there are too few candidates, and for the reasons."""
     reasons = {
         StarCut.FAINT: f"of S/N below {min_snr:g}",
-        StarCut.FLAGGED: "saturated, blended, or with masked pixels or an edge on their stamps",
+        StarCut.FLAGGED: "saturated, blended, masked in most of their core, or at an edge",
         StarCut.NEIGHBOUR: "with a neighbour",
         StarCut.WIDTH: f"of a FWHM below {LEAST_FWHM:g} pixels",
     }
@@ -155,7 +154,7 @@ def _cuts_of_single_objects(
     """Return the cuts of objects by their flags, but for harmless ones, by bad pixels on their stamps, and by S/N."""
     bad = _bad_pixels(image, mask)
     measured = np.isfinite(objects.half_light_radius) & np.isfinite(objects.fwhm)
-    spoilt = cut_out(bad, objects.x, objects.y, size, True).any(axis=(1, 2))
+    spoilt = spoilt_stars(bad, objects, size)
     cuts = np.zeros(len(objects), dtype=np.int32)
     cuts[((objects.flags & ~harmless) != 0) | spoilt | ~measured] |= StarCut.FLAGGED
     cuts[~(objects.snr >= min_snr)] |= StarCut.FAINT
@@ -176,7 +175,7 @@ def _selection(
 ) -> StarSelection:
     """Return the objects without cuts as stars."""
     radii = objects.half_light_radius[cuts == 0]
-    light = np.where(_bad_pixels(image, mask), 0.0, np.asarray(image) - objects.background)
+    light = np.where(_bad_pixels(image, mask), np.nan, np.asarray(image) - objects.background)
     return StarSelection.of_objects(
         objects, cuts, median_and_sigma(radii) if len(radii) else (np.nan, np.nan), light, size
     )

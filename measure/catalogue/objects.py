@@ -26,7 +26,8 @@ class ObjectFlag(IntFlag):
     """Defects of a detected object; zero for a good one.
 
     ``EDGE``: its pixels or its aperture reach the edge of the image. ``SATURATED``: it has saturated pixels.
-    ``BLENDED``: deblended from another object. ``MASKED``: masked pixels within its aperture.
+    ``BLENDED``: deblended from another object. ``MASKED``: masked pixels with few good neighbours within its aperture,
+    or in most of its core; others are filled.
     """
 
     GOOD = 0

@@ -17,11 +17,12 @@ from ...core.result import Result
 from ...core.statistics import RMS_PER_MAD
 from ...core.units import real_array, require_count, require_positive
 from ..masked_moments import MOST_MASKED
-from ..pixel_masks import bad_pixels, fill_symmetric
-from ..stamps import center_stamps
+from ..pixel_masks import bad_pixels
+from ..stamps import center_masks, center_stamps
 from .cutouts import cut_out, first_pixel
 from .objects import DetectedObjects
 from .pixel_checks import flagged
+from .scattered_pixels import fill_stamps
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,13 +52,15 @@ _LEAST_SIDE = 21
 _MOST_SIDE = 101
 # Margin of a stamp for the light that its Fourier shift wraps around [pixel].
 _MARGIN = 8
+# Stars that are shifted at a time, which bounds the memory.
+_TOGETHER = 1024
 
 
 class StarCut(IntFlag):
     """Reasons for the rejection of an object as a star; zero for a selected one.
 
-    ``FLAGGED``: edge, saturated, blended or masked, or such pixels within the inner half of the stamp or most of it, or
-    a stamp that reaches beyond the image. ``FAINT``: below the least S/N.
+    ``FLAGGED``: edge, saturated, blended or masked, or masked pixels in most of the core or of the stamp, or a stamp
+    that reaches beyond the image. ``FAINT``: below the least S/N.
     ``SIZE``, ``WIDTH``, ``SHAPE``: half-light radius, FWHM and ellipticity apart from those of the locus.
     ``NEIGHBOUR``: another object nearby. ``DEFECT``: a stamp that is not that of a single star.
     """
@@ -126,7 +129,7 @@ class StarSelection(Result):
         The selected stars shifted to the centre of a pixel, background subtracted, in the unit of the image, [k, size,
         size].
     masks : array of bool, optional
-        Pixels of the stamps without weight, which hold those opposite the centre, [k, size, size]; None without any.
+        Pixels of the stamps without weight, filled from the star's other ones, [k, size, size]; None without any.
     """
 
     _table = ("index", "positions", "snr")
@@ -161,8 +164,7 @@ class StarSelection(Result):
         """
         index = np.flatnonzero(cuts == 0)
         x, y = objects.x[index], objects.y[index]
-        stamps = centered_stamps(light, x, y, size)
-        weightless = np.isnan(stamps)
+        stamps, weightless = centered_stamps(light, x, y, size)
         return cls(
             index=index,
             cuts=cuts,
@@ -170,7 +172,7 @@ class StarSelection(Result):
             width=radii[1],
             positions=np.stack([x, y], axis=1),
             snr=objects.snr[index],
-            stamps=fill_symmetric(stamps, weightless) if weightless.any() else stamps,
+            stamps=stamps,
             masks=weightless if weightless.any() else None,
         )
 
@@ -295,7 +297,7 @@ def select_stars(
     snr = np.where(np.isfinite(objects.half_light_radius), objects.snr, 0.0)
     radius = np.where(np.isfinite(objects.half_light_radius), objects.half_light_radius, 0.0)
     cuts = np.zeros(len(objects), dtype=np.int32)
-    spoilt = _spoilt(bad, objects.x, objects.y, size)
+    spoilt = spoilt_stars(bad, objects, size)
     cuts[(objects.flags != 0) | spoilt | ~np.isfinite(objects.fwhm)] |= StarCut.FLAGGED
     cuts[~(snr >= min_snr)] |= StarCut.FAINT
     bright = (cuts == 0) & (snr >= locus.bright_snr)
@@ -322,12 +324,16 @@ def select_stars(
     return StarSelection.of_objects(objects, cuts, (center, width), light, size)
 
 
-def _spoilt(bad: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> np.ndarray:
-    """Return objects whose stamps reach beyond the image, or hold bad pixels in their inner half or in most of it."""
+def spoilt_stars(bad: np.ndarray, objects: DetectedObjects, size: int) -> np.ndarray:
+    """Return objects whose stamps reach beyond the image, or of which most of the core or of the stamp is bad."""
+    x, y = objects.x, objects.y
     beyond = cut_out(np.zeros(bad.shape, dtype=bool), x, y, size, True).any(axis=(1, 2))
     stamps = cut_out(bad, x, y, size, True)
-    inner = slice(size // 4, size - size // 4)
-    return np.asarray(beyond | stamps[:, inner, inner].any(axis=(1, 2)) | (stamps.mean(axis=(1, 2)) > MOST_MASKED))
+    dx, dy = ((np.arange(size) + first_pixel(at, size)[:, None] - at[:, None]) for at in (x, y))
+    radius = np.fmax(objects.half_light_radius, 1.0)
+    core = np.hypot(dx[:, None, :], dy[:, :, None]) <= radius[:, None, None]
+    of_core = (core & stamps).sum(axis=(1, 2)) > MOST_MASKED * core.sum(axis=(1, 2))
+    return np.asarray(beyond | of_core | (stamps.mean(axis=(1, 2)) > MOST_MASKED))
 
 
 def _stellar_locus(radius: np.ndarray, least: int) -> tuple[float, float]:
@@ -367,10 +373,22 @@ def median_and_sigma(values: np.ndarray) -> tuple[float, float]:
     return middle, RMS_PER_MAD * float(np.median(np.abs(values - middle)))
 
 
-def centered_stamps(image: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> np.ndarray:
-    """Return stamps with stars shifted to the centre of their middle pixel."""
+def centered_stamps(image: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return stars shifted to the centre of their middle pixel, and the pixels without weight, [n, size, size] each.
+
+    Pixels of the image that are NaN have no weight: they are shifted as :func:`~.scattered_pixels.fill_stamps` fills
+    them.
+    """
     side = size + 2 * _MARGIN
-    around = cut_out(image, x, y, side, 0.0)
-    middle = 0.5 * (side - 1)
-    dx, dy = (at - first_pixel(at, side) - middle for at in (x, y))
-    return center_stamps(around, dx, dy, size, normalize=False)
+    stamps, weightless = np.empty((len(x), size, size)), np.zeros((len(x), size, size), dtype=bool)
+    for first in range(0, len(x), _TOGETHER):
+        rows = slice(first, first + _TOGETHER)
+        around = cut_out(image, x[rows], y[rows], side, 0.0)
+        dx, dy = (at[rows] - first_pixel(at[rows], side) - 0.5 * (side - 1) for at in (x, y))
+        bad = np.isnan(around)
+        if bad.any():
+            masked = np.flatnonzero(bad.any(axis=(1, 2)))
+            around[masked] = fill_stamps(around[masked], bad[masked], dx[masked], dy[masked])[0]
+            weightless[first + masked] = center_masks(bad[masked], dx[masked], dy[masked], size)
+        stamps[rows] = center_stamps(around, dx, dy, size, normalize=False)
+    return stamps, weightless

@@ -124,7 +124,14 @@ class PeakShapes(Result):
         ----------
         x, y : array
             Places of the objects [pixel], [n], at least one.
+
+        Raises
+        ------
+        DomainError
+            If there is no peak.
         """
+        if not len(self):
+            raise DomainError("no peaks: expected some apart from masked pixels and the border")
         places = np.stack([real_array(v, f"{name}: expected real numbers") for v, name in ((x, "x"), (y, "y"))], axis=1)
         nearest = cKDTree(places).query(np.stack([self.x, self.y], axis=1))[1]
         columns = np.vstack([self.shapes.sums.T, self.weight, self.weight * self.snr])

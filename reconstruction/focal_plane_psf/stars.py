@@ -39,6 +39,8 @@ SAME_ROTATOR = 1e-6
 _SAME_WEIGHT = 1e-6
 # Pixels of the mean star that are changed at a time: of all at once, wide stamps would fill the memory.
 _PIXELS_TOGETHER = 1024
+# Least part of the variance of a shape that the good pixels of a star have: fewer would not be a star.
+_LEAST_SHOWN = 0.05
 
 
 class CcdStars(NamedTuple):
@@ -52,14 +54,16 @@ class CcdStars(NamedTuple):
     noise: tuple[float, float]  #: sky, and rms noise without light [electrons/pixel]
     stamps: np.ndarray  #: centred, of unit flux, [n, ny, nx]
     used: np.ndarray  #: stars to use, [n] bool
+    masks: np.ndarray | None = None  #: pixels of the stamps that were filled, [n, ny, nx] bool
 
     def columns(self) -> tuple[np.ndarray, ...]:
-        """Return name, x, y, values, electrons, variance of a pixel without the star and stamp of the used stars."""
+        """Return name, x, y, values, electrons, variance of a pixel without the star, stamp and mask of used stars."""
         used, shapes = self.used, self.shapes
         values = np.stack([shapes.e1, shapes.e2, np.log(shapes.size)], axis=1)[used]
         level = np.full(len(values), self.noise[0] + self.noise[1] ** 2)
         names = np.full(len(values), self.name)
-        return names, self.x[used], self.y[used], values, self.electrons[used], level, self.stamps[used]
+        masks = np.zeros(self.stamps.shape, dtype=bool) if self.masks is None else self.masks
+        return names, self.x[used], self.y[used], values, self.electrons[used], level, self.stamps[used], masks[used]
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,8 +146,9 @@ class FocalPlaneStars(Result):
         parts = [ccd_columns.columns() for ccd_columns in ccds]
         if not any(len(ccd_columns[0]) for ccd_columns in parts):
             raise DomainError("no stars: expected products with stars that a PSF model can use")
-        names, x, y, values, electrons, level, stamps = (np.concatenate(column) for column in zip(*parts, strict=True))
-        noise = photon_noise(stamps, electrons, level, pixel_scale, weight_fwhm)
+        columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+        names, x, y, values, electrons, level, stamps, masks = columns
+        noise = photon_noise(stamps, electrons, level, pixel_scale, weight_fwhm, masks)
         return cls(tuple(names.tolist()), x, y, values, noise, stamps, pixel_scale, weight_fwhm, pixels)
 
     @classmethod
@@ -292,12 +297,18 @@ def _product_weight_fwhm(product: Path) -> float:
 
 
 def photon_noise(
-    stamps: np.ndarray, electrons: np.ndarray, level: np.ndarray, pixel_scale: float, weight_fwhm: float
+    stamps: np.ndarray,
+    electrons: np.ndarray,
+    level: np.ndarray,
+    pixel_scale: float,
+    weight_fwhm: float,
+    masks: np.ndarray | None = None,
 ) -> np.ndarray:
     r"""Return standard deviations of e1, e2 and ln size of stars of given electrons, shape [n, 3].
 
     With the mean star I of unit sum, the derivatives g of a shape with respect to its pixels, and F electrons over a
-    background of variance V a pixel, the variance is :math:`\sum g^2 (V / F^2 + I / F)`.
+    background of variance V a pixel, the variance is :math:`\sum g^2 (V / F^2 + I / F)`, over the part of it that the
+    pixels without a mask have.
 
     Parameters
     ----------
@@ -307,10 +318,19 @@ def photon_noise(
         Of each star.
     level : ndarray, shape [n]
         Variance of a pixel without the star [electron^2].
+    masks : ndarray of bool, shape [n, ny, nx], optional
+        Pixels of the stamps that tell nothing of the shape.
     """
     mean, slopes = _mean_star(stamps, electrons / np.sqrt(electrons + level), pixel_scale, weight_fwhm)
     white, photons = (slopes**2).sum(axis=1), (slopes**2 * np.maximum(mean.ravel(), 0.0)).sum(axis=1)
-    return np.sqrt(white * (level / electrons**2)[:, None] + photons / electrons[:, None])
+    variances = white * (level / electrons**2)[:, None] + photons / electrons[:, None]
+    if masks is not None and (masked := np.flatnonzero(masks.any(axis=(1, 2)))).size:
+        hidden = masks[masked].reshape(len(masked), -1)
+        hidden_white, hidden_photons = hidden @ (slopes**2).T, hidden @ (slopes**2 * np.maximum(mean.ravel(), 0.0)).T
+        of_hidden = hidden_white * (level / electrons**2)[masked, None] + hidden_photons / electrons[masked, None]
+        # Shapes are those of the other pixels: as much less is known of them.
+        variances[masked] /= np.maximum(1.0 - of_hidden / variances[masked], _LEAST_SHOWN)
+    return np.sqrt(variances)
 
 
 def noise_per_snr(stamps: np.ndarray, snr: np.ndarray, pixel_scale: float, weight_fwhm: float) -> np.ndarray:

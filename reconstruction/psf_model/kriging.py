@@ -21,6 +21,7 @@ import numpy as np
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, PachonError, attempt
+from ...core.memory import require_bytes
 from ...core.statistics import RMS_PER_MAD, finite_row_medians, row_medians
 from ...core.threads import one_blas_thread
 from .colour import FittedColour
@@ -68,6 +69,8 @@ _LEAST_FACTOR = 0.1
 _LEAST_NOISE = 1e-6
 #: Stars of fewer photons are not in electrons.
 FEWEST_ELECTRONS = 100.0
+# Numbers of all pairs of stars that are in memory at a time: 1.5 GB for 5000 stars.
+_NUMBERS_PER_PAIR = 8
 
 
 @check_arguments
@@ -128,6 +131,8 @@ class _StarShapes:
                 places, stars.coefficients, terms, covariances, of_stars, colour_count=colour_count
             )
         else:
+            count_text = f"kriging of {len(places)} stars (recipe 'paper' has no matrix of them)"
+            require_bytes(8 * _NUMBERS_PER_PAIR * len(places) ** 2, count_text)
             narrow_filters = shape_numbers(mean, self.deviations, _NARROW * core_variance(mean))[1]
             all_filters = np.concatenate([self.filters, narrow_filters])
             shapes = self.deviations @ all_filters.T

@@ -117,6 +117,26 @@ def test_flags_and_neighbours():
     assert near[1] == pytest.approx(np.hypot(32.0, 40.0), abs=0.1)
 
 
+def test_scattered_bad_pixels_are_filled_by_their_objects():
+    clean = image_of()
+    mask = np.random.default_rng(2).random(clean.shape) < 0.03
+    x, y = np.rint(PLACES).astype(int).T
+    mask[y, x] = True  # the brightest pixel of each
+    mask[:, x[3] + 1] = True
+    complete = pachon.detect_objects(clean, VARIANCE, background_size=None)
+    masked = pachon.detect_objects(np.where(mask, 1e5, clean), VARIANCE, mask, background_size=None)
+    one, other = (pachon.measure.match_positions(*PLACES.T, o.x, o.y, 1.0) for o in (complete, masked))
+    assert (masked.flags[other] == 0).all()
+    pulls = (masked.flux[other] - complete.flux[one]) / complete.flux_error[one]
+    assert np.abs(pulls).max() < 1.5
+    assert (masked.flux_error[other] > 1.01 * complete.flux_error[one]).all()
+    np.testing.assert_allclose(masked.half_light_radius[other], complete.half_light_radius[one], rtol=0.03)
+    near = [(getattr(masked, name)[other], getattr(complete, name)[one]) for name in "xy"]
+    # A centroid of S/N 60 has an error of 0.05 pixels.
+    for values, expected in near:
+        np.testing.assert_allclose(values, expected, rtol=0, atol=0.07)
+
+
 def test_a_single_object_has_no_neighbour():
     found = pachon.detect_objects(gaussian(80.0, 80.0, 1e4), VARIANCE, background_size=None)
     assert found.neighbour_distance.tolist() == [np.inf]

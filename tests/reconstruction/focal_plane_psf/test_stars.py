@@ -49,6 +49,17 @@ def test_photon_noise_is_the_scatter_of_measured_shapes(electrons, level):
     assert ((more < found) & (more > 0.5 * found)).all()
 
 
+def test_masked_pixels_count_in_the_noise():
+    masks = np.zeros((3, SIZE, SIZE), dtype=bool)
+    masks[1, :, : SIZE // 2] = True
+    masks[2, :, SIZE // 2] = True
+    found = photon_noise(np.repeat(star()[None], 3, axis=0), np.full(3, 1e5), np.full(3, 9.0), PIXEL, WEIGHT, masks)
+    np.testing.assert_allclose(found[0], photon_noise(star()[None], np.full(1, 1e5), np.full(1, 9.0), PIXEL, WEIGHT)[0])
+    # Without one half of the star half of what is known is left; the middle column is in neither half.
+    lost = 1.0 - (found[0] / found[1:]) ** 2
+    np.testing.assert_allclose(lost[0] + 0.5 * lost[1], 0.5, rtol=0.02)
+
+
 @pytest.mark.long
 def test_noise_per_snr_is_the_scatter_of_faint_stars():
     electrons, level = 2e4, 2000.0

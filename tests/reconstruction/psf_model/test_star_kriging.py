@@ -336,3 +336,12 @@ def test_noise_of_faint_stars_is_no_part_of_their_core():
         assert 0.4 * expected < kriging.core_variance(noisy) < 1.5 * expected
     # A star of one pixel has a weight too.
     assert kriging.core_variance(np.where(x**2 + y**2 > 0, 0.0, 1.0)) > 0.0
+
+
+def test_too_many_stars_for_the_memory_are_one_clear_line(monkeypatch):
+    rng = np.random.default_rng(3)
+    places = rng.uniform(-1.0, 1.0, (40, 2))
+    monkeypatch.setattr("pachon.core.memory.available_bytes", lambda: 64 * 40**2 - 1)
+    message = r"kriging of 40 stars \(recipe 'paper' has no matrix of them\): needs about 0.1 MB of memory, 0.1 MB are"
+    with pytest.raises(DomainError, match=message):
+        PsfModel.fit(gaussian_stars(rng, 40), places, extent=EXTENT)
