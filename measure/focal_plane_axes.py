@@ -112,7 +112,12 @@ def draw_key_whisker(axes: Axes, ellipticity: float, scale: float, width: float)
 
 
 def draw_compass(axes: Axes, north: np.ndarray, east: np.ndarray) -> None:
-    """Draw arrows to north and east, unit vectors along the axes [2], in the lower left corner; scales are equal."""
+    """Draw arrows to north and east, unit vectors along the axes [2], in the lower left corner; scales are equal.
+
+    Directions that are not finite are unknown, and none is drawn.
+    """
+    if not np.isfinite([north, east]).all():
+        return
     center = (_COMPASS_PLACE, _COMPASS_PLACE)
     for name, (x, y) in (("N", north), ("E", east)):
         tip, label = (

@@ -284,10 +284,11 @@ class PsfStack(Result):
 
     @property
     def sky_directions(self) -> tuple[np.ndarray, np.ndarray]:
-        """North and east as unit vectors along the axes of the stack, [2] each."""
+        """North and east as unit vectors along the axes of the stack, [2] each; NaN where points do not tell them."""
         sky, places = np.stack([self.xi, self.eta], axis=1), np.stack([self.x, self.y], axis=1)
         to_places = np.linalg.lstsq(sky, places, rcond=None)[0]  # rows: x, y of a step in xi, and in eta
-        east, north = to_places / np.linalg.norm(to_places, axis=1, keepdims=True)
+        length = np.linalg.norm(to_places, axis=1, keepdims=True)
+        east, north = to_places / np.where(length > 0.0, length, np.nan)
         return north, east
 
     def __len__(self) -> int:
