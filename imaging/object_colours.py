@@ -41,7 +41,7 @@ class ObjectColours:
     values: np.ndarray
 
     def __post_init__(self) -> None:
-        if self.positions.ndim != 2 or self.positions.shape != (len(self.values), 2) or self.values.ndim != 1:
+        if self.values.ndim != 1 or self.positions.shape != (len(self.values), 2):
             raise DomainError(
                 f"positions have shape {self.positions.shape}, values {self.values.shape}: expected [k, 2] and [k]"
             )
