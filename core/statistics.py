@@ -8,6 +8,8 @@ import numpy as np
 RMS_PER_MAD = 1.4826
 #: FWHM of a Gaussian over its standard deviation.
 FWHM_PER_RMS = float(np.sqrt(8.0 * np.log(2.0)))
+# Standard deviations by which the mean square of noise may be above its variance.
+_CHANCE = 2.0
 
 
 def finite_mean(values: np.ndarray) -> float:
@@ -100,3 +102,13 @@ def masked_median(values: np.ndarray, masks: np.ndarray) -> np.ndarray:
         for middle in ((count - 1) // 2, count // 2)
     )
     return np.where(count > 0, 0.5 * (low + high), np.nan)
+
+
+def signal_share(square: np.ndarray, variance: np.ndarray | float, scatter: np.ndarray | float) -> np.ndarray:
+    """Return the part of mean squares [n] that is not noise of a variance, and not chance; 1 where they are zero.
+
+    `scatter` is the standard deviation of the mean square of the noise over its variance.
+    """
+    by_chance = variance * (1.0 + _CHANCE * scatter)
+    ratio = np.divide(by_chance, square, out=np.zeros_like(square), where=square > 0.0)
+    return np.asarray(np.maximum(1.0 - ratio, 0.0))

@@ -18,7 +18,7 @@ from ...measure.shapes import measure_shapes
 from .covariance import Covariance, Places
 from .kriging import leave_one_out, map_on_threads, neighbourhood, neighbours_of
 from .likelihood import blocks_of, fit_covariance
-from .mean_star import limited
+from .mean_star import edge_of, limited
 from .mosaic import Mosaic
 
 # The three deformations, as coefficients of kx^2, ky^2 and kx ky: along x, along x = y, and round.
@@ -139,9 +139,7 @@ class ResidualImages:
         root = np.sqrt(weight / weight.mean())[:, None]
         _, values, rows = np.linalg.svd(flat * root, full_matrices=False)
         # Noise alone makes the largest singular value sigma (sqrt(n) + sqrt(pixels)) (Marchenko & Pastur 1967).
-        edge = np.ones((ny, nx), dtype=bool)
-        edge[ny // 6 : -(ny // 6), nx // 6 : -(nx // 6)] = False
-        sigma = float(np.std((flat * root)[:, edge.ravel()]))
+        sigma = float(np.std((flat * root)[:, edge_of((ny, nx)).ravel()]))
         keep = min(count, int((values > 1.05 * sigma * (np.sqrt(n) + np.sqrt(ny * nx))).sum()))
         if keep == 0:
             return None

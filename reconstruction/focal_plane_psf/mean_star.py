@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...core.statistics import signal_share
 from ...measure.star_flux import with_unit_flux
 
-# Standard deviations by which the mean power of noise in a ring of frequencies may be above its expectation.
-_CHANCE = 2.0
 # Pixels at each edge of a stamp that are taken for sky, of its side.
 _EDGE = 6
 
@@ -27,20 +26,25 @@ def mean_star(stamps: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.nd
         return np.zeros((ny, nx)), np.ones(cycles.shape)
     unit, share = unit[lit], weight[lit] / weight[lit].sum()
     mean = np.einsum("n,nyx->yx", share, unit)
-    sky = np.ones((ny, nx), dtype=bool)
-    sky[ny // _EDGE : -(ny // _EDGE), nx // _EDGE : -(nx // _EDGE)] = False
-    noise = float(share**2 @ (unit - mean)[:, sky].var(axis=1))
+    noise = float(share**2 @ (unit - mean)[:, edge_of((ny, nx))].var(axis=1))
     spectrum = np.fft.rfft2(mean)
     ring = np.rint(cycles * max(ny, nx)).astype(int)
     count = np.bincount(ring.ravel())
     power = np.bincount(ring.ravel(), (np.abs(spectrum) ** 2).ravel()) / count
-    by_chance = noise * mean.size * (1.0 + _CHANCE / np.sqrt(count))
-    signal = np.maximum(1.0 - by_chance / np.maximum(power, np.finfo(float).tiny), 0.0)
+    signal = signal_share(power, noise * mean.size, 1.0 / np.sqrt(count))
     signal[0] = 1.0
     # Beyond the first ring that is noise the PSF does not come back.
     passed = np.where(np.minimum.accumulate(signal) > 0.0, signal, 0.0)[ring]
     mean = limited(mean, passed)
     return mean / mean.sum(), passed
+
+
+def edge_of(shape: tuple[int, int]) -> np.ndarray:
+    """Return the pixels at the edges of a stamp of a shape (ny, nx), which are taken for sky, bool [ny, nx]."""
+    ny, nx = shape
+    edge = np.ones(shape, dtype=bool)
+    edge[ny // _EDGE : -(ny // _EDGE), nx // _EDGE : -(nx // _EDGE)] = False
+    return edge
 
 
 def limited(images: np.ndarray, passed: np.ndarray) -> np.ndarray:

@@ -322,12 +322,12 @@ def photon_noise(
         Pixels of the stamps that tell nothing of the shape.
     """
     mean, slopes = _mean_star(stamps, electrons / np.sqrt(electrons + level), pixel_scale, weight_fwhm)
-    white, photons = (slopes**2).sum(axis=1), (slopes**2 * np.maximum(mean.ravel(), 0.0)).sum(axis=1)
-    variances = white * (level / electrons**2)[:, None] + photons / electrons[:, None]
+    white, photons = slopes**2, slopes**2 * np.maximum(mean.ravel(), 0.0)
+    of_white, light = (level / electrons**2)[:, None], electrons[:, None]
+    variances = white.sum(axis=1) * of_white + photons.sum(axis=1) / light
     if masks is not None and (masked := np.flatnonzero(masks.any(axis=(1, 2)))).size:
         hidden = masks[masked].reshape(len(masked), -1)
-        hidden_white, hidden_photons = hidden @ (slopes**2).T, hidden @ (slopes**2 * np.maximum(mean.ravel(), 0.0)).T
-        of_hidden = hidden_white * (level / electrons**2)[masked, None] + hidden_photons / electrons[masked, None]
+        of_hidden = hidden @ white.T * of_white[masked] + hidden @ photons.T / light[masked]
         # Shapes are those of the other pixels: as much less is known of them.
         variances[masked] /= np.maximum(1.0 - of_hidden / variances[masked], _LEAST_SHOWN)
     return np.sqrt(variances)

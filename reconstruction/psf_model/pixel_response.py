@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-# Standard deviations by which the mean square of noise may be above its variance.
-_CHANCE = 2.0
+from ...core.statistics import signal_share
+
 # Pixels of a ring that differ by its noise alone if they are fewer.
 _SEVERAL = 4
 
@@ -25,16 +25,11 @@ def without_noise(star: np.ndarray, noise: np.ndarray) -> np.ndarray:
     def mean(values: np.ndarray) -> np.ndarray:
         return np.asarray(np.bincount(ring, values.ravel()) / count)
 
-    def signal(square: np.ndarray, variance: np.ndarray, count: np.ndarray | float) -> np.ndarray:
-        by_chance = variance * (1.0 + _CHANCE * np.sqrt(2.0 / count))
-        ratio = np.divide(by_chance, square, out=np.zeros_like(square), where=square > 0.0)
-        return np.asarray(np.maximum(1.0 - ratio, 0.0))
-
     centre, variance, profile = mean(radius), mean(noise), mean(star)
-    profile *= signal(profile**2, variance / count, 1.0)
+    profile *= signal_share(profile**2, variance / count, np.sqrt(2.0))
     smooth = np.interp(radius, centre, profile)
     difference = star - smooth
-    share = signal(mean(difference**2), variance, count)
+    share = signal_share(mean(difference**2), variance, np.sqrt(2.0 / count))
     several = count >= _SEVERAL
     return np.asarray(smooth + np.interp(radius, centre[several], share[several]) * difference)
 
