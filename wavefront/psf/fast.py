@@ -33,11 +33,17 @@ from ...core.launch import launch
 from ...core.units import require_count
 from ...core.warp_arrays import warp_array
 from ..atmosphere.layer_screens import SLOPE_LAG
-from ..atmosphere.turbulence import coherence, diffraction_otf, slope_variance, structure_function
+from ..atmosphere.turbulence import (
+    coherence,
+    diffraction_otf,
+    long_exposure_fwhm,
+    slope_variance,
+    structure_function,
+)
 from ..pupil_optics import PupilOptics
 from .clear_pupil import lit_fractions
 from .engine import ExposedStars, PsfEngine, PsfInputs, PsfRenderer, Stars, expose_by_kind, metric_of
-from .far_from_focus import sampling_refinement
+from .far_from_focus import blur_radii, sampling_refinement
 from .fast_kernels import combine_wavelengths, deposit_rays
 from .image_plane import square_transfer
 from .inner_rim import clipped_by_apertures, traced_obscuration
@@ -61,6 +67,11 @@ LEAST_SAMPLES = 4
 OVERSAMPLING = 2
 #: Cells per pixel by default, without an atmosphere: an undisturbed spot may be no larger than a quarter of a pixel.
 OVERSAMPLING_STILL = 12
+#: Largest cell over the width of an image, and most cells per pixel: pixels as wide as the seeing need more cells.
+#: Cells of half of the width would make the brightest pixel 5 % too bright, of 1.5 widths 44 %; of 0.33, 0.25 %.
+LARGEST_CELL, MOST_CELLS = 0.3, 32
+#: The same over the width without charge diffusion: rays that share one cell are taken for its middle.
+LARGEST_CELL_OF_RAYS = 0.5
 #: Distance on the CCD of the rays of neighbouring pupil points [pixels], with an atmosphere, beyond which a star counts
 #: as far from focus and is drawn with more points, and the largest that it then has.
 RAY_DISTANCE = (1.0, 0.25)
@@ -109,7 +120,8 @@ class FastEngine(PsfEngine):
         Approximate number of pupil points, at least 10: the lattice is a whole number of screen pixels wide. By default
         334, and 5000 without an atmosphere; more for stars far from focus.
     oversampling : int, optional
-        Cells of the fine grid per pixel, 1 to 32; 2 by default, and 12 without an atmosphere.
+        Cells of the fine grid per pixel, 1 to 32; by default 2, 12 without an atmosphere, and up to 32 where images
+        are narrower than 3.3 of these cells.
 
     Raises
     ------
@@ -139,18 +151,22 @@ class FastRenderer(PsfRenderer):
     depths = 2
 
     def __init__(
-        self, inputs: PsfInputs, options: FastEngine, refinement: int = 1, far_from_focus: bool = False
+        self,
+        inputs: PsfInputs,
+        options: FastEngine,
+        refinement: int = 1,
+        far_from_focus: bool = False,
+        oversampling: int | None = None,
     ) -> None:
         super().__init__(inputs)
         self._options, self._refinement = options, refinement
         #: Inner radius of the points over the outer one.
         self._inner = traced_obscuration(self._obscuration) if far_from_focus else self._obscuration
-        still, n_pupil, oversampling = inputs.atmosphere is None, options.n_pupil, options.oversampling
+        still, n_pupil = inputs.atmosphere is None, options.n_pupil
         if n_pupil is None:
             n_pupil = PUPIL_POINTS_STILL if still else PUPIL_POINTS
-        if oversampling is None:
-            oversampling = OVERSAMPLING_STILL if still else OVERSAMPLING
-        self._oversampling = oversampling
+        usual = OVERSAMPLING_STILL if still else OVERSAMPLING
+        self._oversampling = options.oversampling or oversampling or usual
         self._place_pupil(n_pupil)
         self._make_grid()
         self._filter_step, self._filter = self._filter_table()
@@ -163,8 +179,9 @@ class FastRenderer(PsfRenderer):
             self._units = np.array([inputs.atmosphere.slope_unit(n) for n in layers], dtype=np.float32)
         grid_bytes = 4 * len(self._channels.wave) * self._grid_size**2
         self._grid_batch = max(1, _GRID_BYTES // grid_bytes)
-        # Besides its spectrum, each star of a batch has rays.
-        star_bytes = 4 * self._grid_size**2 + _RAY_BYTES * len(self._wavelengths) * len(self._points)
+        # Besides its spectrum, on the finest of grids that stars may need, each star of a batch has rays.
+        finest = self._grid_size if options.oversampling else self._grid_side(int(self._cells_needed(np.zeros(1))[0]))
+        star_bytes = 4 * finest**2 + _RAY_BYTES * len(self._wavelengths) * len(self._points)
         self.batch = max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
 
     def _place_pupil(self, n_pupil: int) -> None:
@@ -194,16 +211,43 @@ class FastRenderer(PsfRenderer):
     def _make_grid(self) -> None:
         """Lay out the fine grid and its frequencies."""
         self._cell = self._plane.pixel_size / self._oversampling
-        margin = GRID_MARGIN_STILL if self._atmosphere is None else GRID_MARGIN
-        size = math.ceil(margin * self._plane.size * self._oversampling)
-        # even, for the half plane of frequencies of a real transform
-        self._grid_size = 2 * scipy.fft.next_fast_len(-(-size // 2), real=True)
+        self._grid_size = self._grid_side(self._oversampling)
         self._ky = 2.0 * math.pi * scipy.fft.fftfreq(self._grid_size, self._cell)
         self._kx = 2.0 * math.pi * scipy.fft.rfftfreq(self._grid_size, self._cell)
         ky = self._ky[:, None]
         # Binning has averaged over a cell already: the filter undoes that.
         detector = self._plane.transfer(self._kx, ky) / square_transfer(self._kx, ky, self._cell)
         self._detector = detector.astype(np.float32)
+
+    def _grid_side(self, oversampling: int) -> int:
+        """Return the cells on a side of the fine grid with so many cells per pixel."""
+        margin = GRID_MARGIN_STILL if self._atmosphere is None else GRID_MARGIN
+        size = math.ceil(margin * self._plane.size * oversampling)
+        # even, for the half plane of frequencies of a real transform
+        return 2 * scipy.fft.next_fast_len(-(-size // 2), real=True)
+
+    def _cells_needed(self, blur: np.ndarray) -> np.ndarray:
+        """Return the cells per pixel, the usual ones times a power of two, of stars whose optics blur by so much.
+
+        The blurs are rms radii [m], [n_star].
+        """
+        usual = OVERSAMPLING_STILL if self._atmosphere is None else OVERSAMPLING
+        rays = np.hypot(self._least_width(), math.sqrt(4.0 * math.log(2.0)) * blur)
+        gauss = math.sqrt(8.0 * math.log(2.0)) * math.hypot(self._plane.diffusion, self._plane.jitter)
+        largest = LARGEST_CELL * np.hypot(rays, gauss)
+        if self._atmosphere is not None:
+            largest = np.minimum(largest, LARGEST_CELL_OF_RAYS * rays)
+        power = np.ceil(np.log2(np.maximum(self._plane.pixel_size / (largest * usual), 1.0)))
+        return np.minimum(usual * 2 ** power.astype(np.int64), MOST_CELLS)
+
+    def _least_width(self) -> float:
+        """Return the width at half maximum of stars of ideal optics, by air and diffraction alone [m]."""
+        ends = (float(self._wavelengths.min()), float(self._wavelengths.max()))
+        air = self._atmosphere
+        if air is None:
+            return ends[0] / self._diameter * self.focal_length
+        pupil = {"diameter": self._diameter, "obscuration": self._obscuration}
+        return self.focal_length * min(long_exposure_fwhm(wave, air.r0, air.outer_scale, **pupil) for wave in ends)
 
     def _filter_table(self) -> tuple[float, np.ndarray]:
         """Return the step of the baselines [m] and the filter at them, shape [n_wave, n]."""
@@ -240,19 +284,25 @@ class FastRenderer(PsfRenderer):
 
     def _expose(self, stars: Stars) -> ExposedStars:
         optics = self._trace(stars.fields, self._points, self._threads)
+        refinement = np.ones(len(stars), dtype=np.int64)
+        cells = np.full(len(stars), self._oversampling)
         if self._options.n_pupil is None:
             pixel = self._plane.pixel_size
             largest, refined = RAY_DISTANCE_STILL if self._atmosphere is None else RAY_DISTANCE
             neighbour = 2.0 * self._lattice.spacing / self._diameter
             refinement = sampling_refinement(optics, neighbour, largest * pixel, refined * pixel)
-            if (refinement > 1).any():
-                return expose_by_kind(refinement, self._expose_refined, stars)
-        return self._expose_traced(optics, stars)
+        if self._options.oversampling is None:
+            cells = self._cells_needed(blur_radii(optics))
+        if (refinement == 1).all() and (cells == self._oversampling).all():
+            return self._expose_traced(optics, stars)
+        samplings, kinds = np.unique(np.stack([refinement, cells], axis=1), axis=0, return_inverse=True)
 
-    def _expose_refined(self, refinement: int, stars: Stars) -> ExposedStars:
-        """Expose stars with a refined sampling of the pupil."""
-        renderer = FastRenderer(self._inputs, self._options, refinement, far_from_focus=refinement > 1)
-        return renderer.expose_without_refinement(stars)
+        def expose(kind: int, stars: Stars) -> ExposedStars:
+            points, oversampling = map(int, samplings[kind])
+            renderer = FastRenderer(self._inputs, self._options, points, points > 1, oversampling)
+            return renderer.expose_without_refinement(stars)
+
+        return expose_by_kind(kinds.reshape(-1), expose, stars)
 
     def expose_without_refinement(self, stars: Stars) -> ExposedStars:
         """Expose stars with the pupil points of this renderer, however far from focus they are."""
