@@ -60,6 +60,9 @@ class ShearEstimator:
     independent (Li & Mandelbaum 2023; Li et al. 2024). The rotation removes what the noise of an elliptical PSF adds
     to e.
 
+    Stamps whose PSF is not sampled are biased under any weight: by about 0.1 % where its FWHM is two pixels, -1 to -3 %
+    at 1.5, -2 to -30 % at one (small galaxies most).
+
     Parameters
     ----------
     psf_images : array

@@ -158,10 +158,20 @@ def _visits(
             "sky", lambda sky: (sky > _SKIES[0]) & (sky < _SKIES[1]), "{:g} to {:g} mag".format(*_SKIES)
         ),
         epoch=epoch,
-        weight=columns.stated("weight", lambda weight: weight > 0.0, "a weight above 0"),
+        weight=_weights(columns),
         source=path.name,
         remarks=tuple(columns.remarks),
     )
+
+
+def _weights(columns: ListColumns) -> np.ndarray:
+    """Return the weights of visits, NaN where there is none, with a remark where others have one."""
+    weights = columns.stated("weight", lambda weight: weight > 0.0, "a weight above 0")
+    without = np.isnan(weights)
+    if without.any() and not without.all():
+        theirs = "the inverse variance of a pixel of the sky [nJy-2], beside the weights of the others"
+        columns.remarks.append(f"{int(without.sum())} of {len(columns)} visits without a weight have {theirs}")
+    return weights
 
 
 def _each_visit_once(columns: ListColumns) -> ListColumns:

@@ -18,7 +18,7 @@ from .visit_product import VisitProduct
 #: Resolution of the coverage of a map, that of LSST's.
 _COVERAGE = 32
 #: Sums that are kept of each pixel.
-_SUMS = ("time", "count", "weight", "sigma", "g1", "g2", "area", "midpoint")
+_SUMS = ("time", "count", "weight", "noise", "sigma", "g1", "g2", "area", "midpoint")
 
 
 @dataclass
@@ -45,10 +45,13 @@ class NightMaps:
         order = np.argsort(table["detector"])
         row = order[np.searchsorted(table["detector"][order], pixels["CCD"])]
         weight, midpoint = table["weight"][row], table["expMidptMJD"][row]
+        # The weight may be that of the list, in any unit.
+        pixel_noise = table["skyNoise"] * 10.0 ** (0.4 * (NANOJANSKY - table["zeroPoint"]))  # nJy
         values = {
             "time": table["expTime"][row],
             "count": np.ones(len(row)),
             "weight": weight,
+            "noise": (weight * pixel_noise[row]) ** 2,
             "sigma": weight * pixels["SIGMA"],
             "g1": weight * pixels["G1"],
             "g2": weight * pixels["G2"],
@@ -84,8 +87,8 @@ def _quantities(band: BandSums, nside: int) -> dict[str, tuple[Any, str]]:
     index = band.sums["weight"].valid_pixels
     at = {name: _values(sums, index) for name, sums in band.sums.items()}
     area = at["area"] / at["weight"]
-    # The noise of a PSF's flux: the stack has the sum of the inverse variances.
-    limit = NANOJANSKY - 2.5 * np.log10(LIMIT_SNR * np.sqrt(area / at["weight"]))
+    # The noise of a PSF's flux in the weighted mean of the visits.
+    limit = NANOJANSKY - 2.5 * np.log10(LIMIT_SNR * np.sqrt(area * at["noise"]) / at["weight"])
     columns = {
         "exposure_time_consolidated_map_sum": (at["time"], "s"),
         "n_exposure_consolidated_map_sum": (at["count"], ""),

@@ -40,7 +40,9 @@ def night_page(
             Picture("Correlation of the PSF, and of what the models leave", correlations_plot(means), shows)
         )
     if maps is not None and maps.bands:
-        shows = "Means over visits, weighted by the inverse variance of a pixel of the sky. North is up, east left."
+        of_list = bool(np.isfinite(visits.weight).any())
+        weights = "weights of the list" if of_list else "inverse variance of a pixel of the sky"
+        shows = f"Means over visits, weighted by the {weights}. North is up, east left."
         pictures.insert(0, Picture("What the night has seen", maps_plot(maps), shows))
     return render(
         Path(__file__).parent / "templates",

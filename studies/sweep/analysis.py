@@ -6,15 +6,16 @@ mean and standard error over the replicas.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.stats import rankdata
 
+from ...core.number_text import counted
 from .file import Point, SweepFile
-from .table import SweepTable, described_metric
+from .table import SweepTable, described_metric, is_compensator
 
 #: Least number of values of a parameter for a curve.
 _CURVE = 2
@@ -203,6 +204,11 @@ def summary(table: SweepTable, sweep: SweepFile) -> dict[str, Any]:
     }
 
 
+def in_order(metrics: Iterable[str]) -> list[str]:
+    """Return metrics in the order of reports: correlations, the purpose of most sweeps, first, compensators last."""
+    return sorted(metrics, key=lambda name: (is_compensator(name), not name.startswith("xi"), name))
+
+
 def verdict(summary: dict[str, Any]) -> str:
     """Return the result of a sweep in one sentence: the parameter that matters most for its first metric."""
     failed, points = summary["failed"], summary["points"]
@@ -210,8 +216,7 @@ def verdict(summary: dict[str, Any]) -> str:
     metrics = {metric: entry for metric, entry in summary["metrics"].items() if entry["range"] is not None}
     if not metrics:
         return f"No metric has a value at any of the {points - failed} computed points.{lost}"
-    # Correlations first, as in the pictures.
-    for metric in sorted(metrics, key=lambda name: (not name.startswith("xi"), name)):
+    for metric in in_order(metrics):
         unit = described_metric(metric)[0]
         for key, form, words in (
             ("largest_change", ".3g", "which it changes by up to"),
@@ -233,8 +238,8 @@ def verdict(summary: dict[str, Any]) -> str:
         if low < high and not (metrics[metric]["largest_change"] or metrics[metric]["rank_correlation"]):
             # Few points, or parameters that are no numbers.
             span = f"{metric} goes from {low:.4g} to {high:.4g}{f' {unit}' if unit else ''}"
-            return f"{span} over the {points - failed} computed points, which do not tell why.{lost}"
-    return f"No parameter changes a metric over the {points - failed} computed points.{lost}"
+            return f"{span} over the {counted(points - failed, 'computed point')}, which do not tell why.{lost}"
+    return f"No parameter changes a metric over the {counted(points - failed, 'computed point')}.{lost}"
 
 
 def _is_numeric(table: SweepTable, name: str) -> bool:

@@ -13,7 +13,7 @@ from ...core.files import make_folder, write_bytes, write_json
 from ...core.page import Picture, render, with_digits, with_error
 from ...pipeline.report.report import TEMPLATES
 from . import plots
-from .analysis import Budget, Curve, allowances, budget, curves, rank_correlations, summary, verdict
+from .analysis import Budget, Curve, allowances, budget, curves, in_order, rank_correlations, summary, verdict
 from .file import SweepFile
 from .store import SweepStore
 from .table import SweepTable, described_metric, described_parameter, read_table
@@ -55,8 +55,7 @@ def write_report(store: SweepStore, folder: Path) -> Path:
 
 def sweep_pictures(table: SweepTable, sweep: SweepFile) -> list[tuple[str, Picture]]:
     """Return the plots for the design of a sweep, with the names of their files."""
-    # Correlations first: they are the purpose of most sweeps.
-    drawn = {m: curves(table, sweep, m) for m in sorted(table.metrics, key=lambda m: (not m.startswith("xi"), m))}
+    drawn = {metric: curves(table, sweep, metric) for metric in in_order(table.metrics)}
     drawn = {metric: metric_curves for metric, metric_curves in drawn.items() if metric_curves}
     pictures = list(_one_at_a_time(table, sweep, drawn)) if drawn else []
     numeric = [n for n, v in table.parameters.items() if v.dtype.kind in "fi" and len(np.unique(v)) > 2]
@@ -132,7 +131,7 @@ def _budget_text(budgets: list[Budget]) -> str:
 
 
 def _random_pictures(table: SweepTable, numeric: list[str]) -> Iterator[tuple[str, Picture]]:
-    ranks = {metric: rank_correlations(table, metric) for metric in table.metrics}
+    ranks = {metric: rank_correlations(table, metric) for metric in in_order(table.metrics)}
     ranks = {metric: metric_ranks for metric, metric_ranks in ranks.items() if metric_ranks}
     if not ranks:
         return

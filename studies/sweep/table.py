@@ -179,8 +179,13 @@ def described_metric(name: str) -> Description:
     metric = STARS.metric(name) or TELESCOPE_METRICS.metric(name)
     if metric is not None:
         return Description(metric.unit, metric.meaning)
-    solved = name.startswith("solved ")
-    return Description(_unit(name), "motion of the compensator" if solved else "metric of another version of pachon")
+    text = "motion of the compensator" if is_compensator(name) else "metric of another version of pachon"
+    return Description(_unit(name), text)
+
+
+def is_compensator(metric: str) -> bool:
+    """Return whether a metric of a sweep is the motion of a compensator."""
+    return metric.startswith("solved ")
 
 
 def described_parameter(name: str) -> Description:

@@ -24,7 +24,7 @@ from ...core.warp_arrays import warp_array
 from ...models.zernike_polynomials import noll_to_nm
 from .field_kernels import add_wavefronts, factor_spectra, pairs, read_splines, spread_over_grid, zernikes
 from .ground_moments import GroundMoments, ground_factor
-from .mean_wavefront import mean_wavefront_covariance, radial_transform
+from .mean_wavefront import mean_sinc_squared, mean_wavefront_covariance, radial_transform
 from .moment_covariance import (
     COARSE,
     ExposedAir,
@@ -54,6 +54,9 @@ _MOST_SAMPLES = 2048
 _LEAST_SAMPLES = 16
 #: Side of the grid of a layer over the outer scale or the pupil, at least: longer modes are left out.
 _LAYER_SIDE = 8.0
+#: Least side of that grid over the pupil that suffices for any outer scale: Zernikes from Z4 on have 1/200^(7/3) = 4e-6
+#: of their variance in longer modes, and 1e-3 where the wind averages the others.
+_LONGEST_SIDE = 200.0
 #: Largest frequency of the mean wavefront times the diameter of the pupil, and that of tables, from zero in so many
 #: steps. Beyond the first Z4 to Z10 have 1 % of their variance, Z12 to Z15 a tenth, Z11, the smallest, a quarter: the
 #: modes below, which are longer, are that much stronger.
@@ -316,7 +319,7 @@ def _draw_wavefronts(
     air: ExposedAir, grid: FieldGrid, seed: int, epoch: int
 ) -> tuple[np.ndarray, tuple[SplineFields, ...]]:
     """Draw Zernikes of the mean wavefront: of layers on the ground [n_noll] [m], and of the others."""
-    least = _LAYER_SIDE * max(air.outer_scale, air.diameter)
+    least = min(_LAYER_SIDE * max(air.outer_scale, air.diameter), _LONGEST_SIDE * air.diameter)
     groups: dict[float, list[int]] = {}
     for n, altitude in enumerate(air.altitudes):
         if altitude > 0.0:
@@ -344,10 +347,14 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
         _white_modes(stream(seed, "atmosphere", epoch, n, "mean wavefront"), 2 * k + 1, k + 1, size)
         for n, k in zip(layers, reach.tolist(), strict=True)
     ]
+    drift = air.exposure * np.array([air.velocities[n] for n in layers])
+    periods = drift / (side * distance)[:, None]
+    long = np.hypot(*periods.T) > 1.0
+    for number in np.flatnonzero(long):
+        noise[number] *= _mean_smear(periods[number], int(reach[number]))
     # In microns: powers of path in metres are below the numbers of float32.
     scale = 1e6 * math.sqrt(float(path_spectrum(0.0, air.r0, air.outer_scale)) * air.outer_scale ** (-11.0 / 3.0))
     weights = np.array([air.weights[n] for n in layers])
-    drift = air.exposure * np.array([air.velocities[n] for n in layers])
     nu = np.linspace(0.0, _LAST / air.diameter, _TABLE + 1)
     root = (nu**2 + air.outer_scale**-2) ** (-11.0 / 12.0)
     radial = root[:, None] * np.stack([radial_transform(j, _LAST, _TABLE + 1, air.obscuration) for j in NOLL], axis=1)
@@ -362,7 +369,7 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
             warp_array(np.cumsum([0, *(modes.size for modes in noise[:-1])]), wp.int32),
             warp_array(reach, wp.int32),
             warp_array(distance, wp.float32),
-            warp_array(drift, wp.float32),
+            warp_array(np.where(long[:, None], 0.0, drift), wp.float32),
             warp_array(strength, zernikes),
             1.0 / side,
             warp_array(radial[: _DRAWN + 2], zernikes),
@@ -374,6 +381,16 @@ def _wavefront_fields(air: ExposedAir, layers: list[int], side: float, seed: int
         ],
     )
     return SplineFields(side, _fields(spectrum, len(NOLL), size))
+
+
+def _mean_smear(periods: np.ndarray, reach: int) -> np.ndarray:
+    """Return the root of the mean smear sinc^2 by the wind over the cells of modes, float32, [2 reach + 1, reach + 1].
+
+    Where the wind blows a layer over more than a period of the grid, [2] periods, the lobe of the smear is narrower
+    than the distance of the modes, and what these have of it is chance.
+    """
+    along = np.arange(-reach, reach + 1)[:, None] * periods[1] + np.arange(reach + 1) * periods[0]
+    return np.sqrt(mean_sinc_squared(along, 0.5 * np.hypot(*periods))).astype(np.float32)
 
 
 def _compensation(frequency: np.ndarray, power: np.ndarray, drift: np.ndarray) -> np.ndarray:

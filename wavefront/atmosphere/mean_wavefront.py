@@ -20,7 +20,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import jv
+from scipy.special import jv, sici
 
 from ...core.errors import DomainError
 from ...models.zernike_polynomials import annular_zernikes, noll_to_nm
@@ -36,8 +36,10 @@ _FOLLOWED = 4.0
 # Largest distance of two stars' light over the diameter of the pupil that they follow.
 _FARTHEST = 200.0
 # Directions over half the plane: enough for the narrow lobe of a long exposure, which is 1/300 rad wide at 1 cycle/m
-# after 15 s of 20 m/s.
+# after 15 s of 20 m/s. Of narrower ones the mean between directions is taken.
 _DIRECTIONS = 768
+# Least half-width of a cell over which a mean of sinc^2 is taken from its integral: below, its middle is as good.
+_LEAST_CELL = 1e-3
 # Values between which frequencies are interpolated, and steps of Newton's from there.
 _TABLE = 4096
 _NEWTON_STEPS = 3
@@ -90,7 +92,7 @@ def mean_wavefront_covariance(
     covariance = np.zeros((n_star, n_noll, n_star, n_noll))
     velocities = np.reshape(atmosphere.velocities, (-1, 2))
     for altitude, weight, velocity in zip(atmosphere.altitudes, atmosphere.weights, velocities, strict=True):
-        layer_power = weight * power[:, None] * np.sinc(plane @ (velocity * atmosphere.exposure)) ** 2
+        layer_power = weight * power[:, None] * _smear(frequency, angle, velocity * atmosphere.exposure)
         apart = altitude * (slopes[:, None] - slopes)
         covariance_at: dict[tuple[float, float], np.ndarray] = {}
         for a in range(n_star):
@@ -143,12 +145,40 @@ def covariance_by_wavefront(air: ExposedAir, lags: np.ndarray, noll: ArrayLike, 
         near = np.flatnonzero(np.hypot(*distance.T) <= _INDEPENDENT * air.outer_scale)
         if altitude == 0.0:
             continue
-        drifted = (weight * np.sinc(plane @ (np.array(velocity) * air.exposure))[:, None] ** 2 * spectra) / scale
+        smear = _smear(frequency, angle, np.array(velocity) * air.exposure).reshape(-1, 1)
+        drifted = (weight * smear * spectra) / scale
         # Cosines in single precision, in a fifth of the time: phases of 4000 rad are right to 3e-4.
         single, turns = drifted.astype(np.float32), (2.0 * np.pi * plane.T).astype(np.float32)
         for some in np.array_split(near, max(1, len(near) // 16)):
             out[some] += scale * (np.cos(distance[some].astype(np.float32) @ turns) @ single)
     return out
+
+
+def _smear(frequency: np.ndarray, angle: np.ndarray, drift: np.ndarray) -> np.ndarray:
+    """Return sinc^2 of the drift [2] [m] at frequencies [1/m] and directions [rad], [n_frequency, n_angle]."""
+    along, across = (
+        np.cos(angle) * drift[0] + np.sin(angle) * drift[1],
+        np.cos(angle) * drift[1] - np.sin(angle) * drift[0],
+    )
+    turns = frequency[:, None] * along
+    smear = np.sinc(turns) ** 2
+    step = np.pi / _DIRECTIONS
+    # Values of sinc^2 less than a cycle apart have its integral; of those farther apart the sum is chance.
+    coarse = frequency * np.hypot(*drift) * step > 1.0
+    smear[coarse] = mean_sinc_squared(turns[coarse], 0.5 * step * np.abs(frequency[coarse, None] * across))
+    return smear
+
+
+def mean_sinc_squared(middle: np.ndarray, half: ArrayLike) -> np.ndarray:
+    """Return the mean of sin^2(pi t)/(pi t)^2 over cells of t, by their middles and half-widths."""
+    width = np.broadcast_to(half, middle.shape)
+    wide = width > _LEAST_CELL
+    mean = np.sinc(middle) ** 2
+    ends = middle[wide] + np.multiply.outer([-1.0, 1.0], width[wide])
+    # The integral from zero, Si(2 pi t)/pi - sin^2(pi t)/(pi^2 t).
+    integral = sici(2.0 * np.pi * ends)[0] / np.pi - ends * np.sinc(ends) ** 2
+    mean[wide] = np.maximum(integral[1] - integral[0], 0.0) / (2.0 * width[wide])
+    return mean
 
 
 def _farthest(altitudes: ArrayLike, lags: np.ndarray, outer_scale: float, diameter: float) -> float:

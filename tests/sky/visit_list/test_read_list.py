@@ -450,6 +450,9 @@ def test_what_a_visit_leaves_open(write_list):
     assert visits.epoch.tolist() == [7, 1002, 8, 9, 10]
     assert visits.outer_scale.tolist() == [7.0, 25.0, 8.0, 9.0, 10.0]
     assert np.isnan([visits.weight[1], visits.wind_speed[1]]).all()
+    assert any(
+        remark.startswith("1 of 5 visits without a weight have the inverse variance") for remark in visits.remarks
+    )
 
 
 def test_snaps_of_an_instance_catalogue_take_time(tmp_path):

@@ -178,3 +178,19 @@ def test_digits_are_those_that_the_error_allows():
         (0.6543, math.nan, "0.654"),
     ):
         assert with_digits(value, error) == text
+
+
+@pytest.mark.usefixtures("empty_pictures")
+def test_motions_of_compensators_come_after_what_they_compensate(tmp_path):
+    content = {"parameters": {"M2.dz_um": {"nominal": 0, "range": [0, 4]}}, "design": {"points": 3}}
+    sweep = read_sweep(content, "test")
+    create_store(tmp_path / "s.sweep", sweep, points := numbered_points(sweep, Path()), {})
+    motions = [f"solved Detector.{name}" for name in ("dx_um", "dy_um", "dz_um", "rx_urad", "ry_urad")]
+    with SweepStore(tmp_path / "s.sweep") as store:
+        for p in points:
+            metrics = dict.fromkeys((*motions, "spot_rms_um"), 10.0 * p.parameters["M2.dz_um"])
+            store.write(PointResult(p.number, metrics, None, 0.1, "here"))
+        report = write_report(store, tmp_path / "report")
+    # Four metrics have curves.
+    assert (report.parent / "curves_spot_rms_um.png").is_file()
+    assert '<p class="verdict">M2.dz_um is the one parameter of spot_rms_um' in report.read_text()

@@ -178,6 +178,22 @@ def test_mean_wavefronts_have_their_covariances(altitudes, side):
     assert np.diag(covariance[0]) == pytest.approx(np.ones(len(NOLL)), abs=0.5 * bound)
 
 
+@pytest.mark.parametrize("outer_scale", [25.0, 1000.0])
+def test_mean_wavefronts_have_their_variances_whatever_the_drift_and_the_outer_scale(outer_scale):
+    """In 600 s the wind blows over ten periods of the grid; a thousand metres are more than the largest grid has."""
+    air = AIR._replace(altitudes=(5000.0,), weights=(1.0,), velocities=((-4.0, 9.0),), outer_scale=outer_scale)
+    air = air._replace(exposure=600.0 if outer_scale == 25.0 else 15.0)
+    theory = np.diag(mean_wavefront_covariance(air, (0.0, 0.0), NOLL, air.diameter, air.obscuration)[0, :, 0])
+    stars = np.random.default_rng(1).uniform(0, 0.1, (5000, 2))
+    square = np.zeros(len(NOLL))
+    for seed in range(2):
+        ground, fields = exposure_fields._draw_wavefronts(air, FieldGrid(512, 0.1), seed, 0)
+        square += 0.5 * (ExposureFields(np.zeros(3), fields[0], None, ground, fields).wavefronts_at(stars) ** 2).mean(0)
+    # Some 60 independent pupils along the side, across the wind, in each of two draws: a tenth.
+    assert square / theory == pytest.approx(np.ones(len(NOLL)), abs=0.35)
+    assert (square / theory).mean() == pytest.approx(1.0, abs=0.15)
+
+
 def test_longer_modes_make_up_for_those_left_out():
     """Of one power at all frequencies up to 1, drawn to 1/8: areas of discs, and lengths of a lobe across the wind."""
     frequency = np.linspace(0.0, 1.0, 8193)

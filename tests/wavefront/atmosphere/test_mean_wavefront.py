@@ -49,6 +49,28 @@ def test_variances_fall_as_one_over_long_times():
     assert np.trace(instant[0, :, 0]) > 8.0 * variance[0]
 
 
+@pytest.mark.parametrize(
+    ("diameter", "speed", "time"),
+    [(1.2, 20.0, 30.0), (4.0, 15.0, 90.0), (8.4, 20.0, 600.0)],
+    ids=["1.2 m", "4 m", "8.4 m"],
+)
+def test_long_exposures_do_not_depend_on_the_direction_of_the_wind(diameter, speed, time):
+    """Radial terms, and pairs of cosine and sine, have one variance whatever the direction; it falls as 1/time."""
+    terms = [4, 5, 6, 11, 14, 15]
+
+    def variances(angle, exposure):
+        wind = (speed * np.cos(angle), speed * np.sin(angle))
+        layer = ExposedAir((5000.0,), (1.0,), (wind,), exposure, 0.16, 25.0, 8.75, diameter, 0.4)
+        z4, z5, z6, z11, z14, z15 = np.diag(mean_wavefront_covariance(layer, (0, 0), terms, diameter, 0.4)[0, :, 0])
+        return np.array([z4, z5 + z6, z11, z14 + z15])
+
+    # The wind crosses 60 pupils.
+    crossed = 60.0 * diameter / speed
+    expected = variances(0.0, crossed) * crossed / time
+    for angle in (0.0, 1.1):
+        assert variances(angle, time) / expected == pytest.approx(np.ones(4), rel=2e-3)
+
+
 def test_stars_share_the_ground_layer_and_nothing_far_apart():
     apart = [(0.0, 0.0), (0.0, 0.0), (np.deg2rad(3.4), 0.0)]
     covariance = mean_wavefront_covariance(air(), apart, [4, 5, 11], DIAMETER, OBSCURATION)
