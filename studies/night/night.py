@@ -30,6 +30,8 @@ VISITS_FOLDER = "visits"
 #: Growth of the number of visits after which tables and maps are written again: all of their times together are then a
 #: multiple of the last one.
 _GROWTH = 1.3
+# Visits from which writing them takes more than some seconds, which is told.
+_MANY = 500
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,8 @@ def run_night(
         if reason:
             reporter.line(f"{visit.label} is left out: {reason}")
         if len(finished) >= max(_GROWTH * written, written + 1) and len(finished) < len(visits):
+            if len(finished) >= _MANY:
+                reporter.line(f"tables and maps of {len(finished)} visits are written")
             write(_read(paths, finished, stamp))
             written = len(finished)
     if parts > 1:
