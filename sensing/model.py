@@ -49,7 +49,8 @@ class DonutAir:
     Attributes
     ----------
     fwhm : float, array [n] or Quantity, optional
-        Seeing [rad], if it is known; fitted by default, with a prior of 0.36 to 1.8 arcsec. 0 is no atmosphere.
+        Seeing [rad], if it is known; fitted by default, with a prior of 0.36 to 1.8 arcsec. 0 is no atmosphere,
+        and none in the errors of a donut.
     outer_scale : float
         Outer scale of the turbulence [m]; infinite for Kolmogorov's.
     atmosphere : Atmosphere, optional

@@ -85,7 +85,9 @@ class Patterns:
         amplitudes = self.columns.T @ patterns
         return np.asarray(amplitudes @ amplitudes.T, dtype=np.float64)
 
-    def sizes(self, others: np.ndarray, telescope: np.ndarray, fitted: np.ndarray) -> PatternSizes:
+    def sizes(
+        self, others: np.ndarray, telescope: np.ndarray, fitted: np.ndarray, absent: bool = False
+    ) -> PatternSizes:
         """Return the strengths of the field and of the telescope's, the surplus of the variance in all, and losses.
 
         They are means over all rms of both fields, without a level and with the best one. Losses, which several donuts
@@ -100,6 +102,8 @@ class Patterns:
             The same of what telescopes are expected to have.
         fitted : ndarray, shape [m, m]
             What the priors of fitted terms among it have of the unit variance of the amplitudes.
+        absent : bool
+            Whether there is none of the field, as without air.
         """
         strengths = np.exp(2.0 * RMS_LOGARITHMS)
         if not len(self.variances):
@@ -109,17 +113,19 @@ class Patterns:
         figures = _FIGURES if telescope.any() else np.ones(1)
         losses = np.full((len(figures), 2, len(strengths)), np.inf)
         surplus = np.zeros_like(losses)
+        # The least rms is next to none.
+        sizes = slice(1 if absent else None)
         for k, size in enumerate(figures):
             losses[k], surplus[k] = self._losses(noise + size**2 * telescope)
-            if losses[k].min() > losses.min() + _HOPELESS:
+            if losses[k, :, sizes].min() > losses[..., sizes].min() + _HOPELESS:
                 break
-        of_rms = _prior((RMS_LOGARITHMS - _USUAL) / _WIDE, _NONE)
-        posterior = _figure_prior(len(figures))[:, None, None] * of_rms * np.exp(losses.min() - losses)
+        of_rms, allowed = _prior((RMS_LOGARITHMS - _USUAL) / _WIDE, _NONE)[sizes], losses[..., sizes]
+        posterior = _figure_prior(len(figures))[:, None, None] * of_rms * np.exp(allowed.min() - allowed)
         posterior /= posterior.sum()
         return PatternSizes(
-            float((posterior * strengths).sum()),
+            0.0 if absent else float((posterior * strengths).sum()),
             float((posterior.sum(axis=(1, 2)) * figures**2).sum()),
-            float((posterior * surplus).sum()),
+            float((posterior * surplus[..., sizes]).sum()),
             -2.0 * logsumexp(-losses, axis=1),
         )
 

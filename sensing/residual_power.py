@@ -117,6 +117,7 @@ def residual_power(
     patterns: np.ndarray | None = None,
     telescope: TelescopePatterns | None = None,
     prior_gradient: np.ndarray | None = None,
+    airless: bool = False,
 ) -> ResidualPower:
     """Return what the residuals of a donut say about the errors of its unknowns.
 
@@ -135,6 +136,8 @@ def residual_power(
     prior_gradient : ndarray, shape [n], optional
         Precisions of the priors times the deviations of the unknowns from their means: residuals are then those at the
         end of the last step of a search, which stops a part of a standard deviation short of it.
+    airless : bool
+        Whether there is none of that field: what is seen in its patterns is the telescope's.
     """
     spreads = np.sqrt(np.diag(covariance))
     scale = np.where(spreads > 0.0, spreads, 1.0)
@@ -161,7 +164,7 @@ def residual_power(
     if telescope is not None:
         of_telescope = beside.power_of(squares.of(telescope.expected))
         fitted = beside.power_of(squares.of(telescope.fitted))
-    sizes = beside.sizes(of_patterns, of_telescope, fitted)
+    sizes = beside.sizes(of_patterns, of_telescope, fitted, airless)
     return ResidualPower(root, inner + sizes.level * (np.eye(n) + inner), sizes.strength, sizes.figure, sizes.losses)
 
 

@@ -133,6 +133,9 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
     if point is not None and len(solution.shared):
         beside = _TermsBeside(instrument, star, point)
         precision, deviation = instrument.prior(star.light, solution.stars[0], solution.shared, solution.prior_weight)
+        seeing = float(solution.stars[0][STRENGTH])
+        # Seeing that is fitted may be none by chance, or because the detector's blur has it.
+        airless = instrument.model.air.fwhm is not None and seeing == 0.0
         power = residual_power(
             point,
             photons,
@@ -140,6 +143,7 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
             beside.patterns,
             beside.telescope,
             precision * deviation,
+            airless,
         )
         residuals, air_losses, further = power.covariance, power.losses, power.figure
         if instrument.model.rims.size > 0.0:
@@ -152,7 +156,7 @@ def star_errors(instrument: Instrument, star: StarSolution) -> StarErrors:
         pulled *= solution.prior_weight
         by_prior, higher = pulled @ pulled.T, pulled[:, terms.higher] @ pulled[:, terms.higher].T
         known_air = instrument.model.air.atmosphere is not None
-        strength = 0.0 if known_air else min(power.strength, _most_air(instrument, float(solution.stars[0][STRENGTH])))
+        strength = 0.0 if known_air else min(power.strength, _most_air(instrument, seeing))
         if strength > 0.0:
             speckles, turbulence = (strength * values for values in beside.air(photons))
             lacking, air = lacking + speckles[:n_star, :n_star], air + turbulence[wavefront, wavefront]

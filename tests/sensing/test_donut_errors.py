@@ -20,6 +20,7 @@ from pachon.sensing.noise import measured_noise
 from pachon.sensing.residual_patterns import RMS_LOGARITHMS, Patterns, figure_strength, losses_of_field
 from pachon.sensing.residual_power import residual_power
 from pachon.sensing.rim_search import power_of_squares
+from pachon.sensing.seeing import Seeing
 from pachon.sensing.star_errors import ErrorParts
 from pachon.wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
 
@@ -32,6 +33,8 @@ OPTIONS = {"model": BLUR, "threads": 1}
 SKY = 500.0
 #: Part of the air that donuts share.
 GROUND = 0.66
+#: Seeing of images through air [rad], and the focal length that turns it into pixels [m].
+SEEING, FOCAL_LENGTH = np.deg2rad(0.7 / 3600.0), 10.31
 
 
 def hill(size=80):
@@ -236,6 +239,16 @@ def test_residuals_say_how_much_telescopes_have_of_higher_orders(ratio):
         assert strength == pytest.approx(ratio**2, rel=0.3) if ratio else strength < 0.05
 
 
+def test_without_air_residuals_are_the_telescopes():
+    """Amplitudes drawn: what air would explain as well is none where there is none."""
+    rng, nothing = np.random.default_rng(4), np.zeros((40, 40))
+    variances = 10.0 * np.arange(1.0, 41.0) ** -1.5
+    drawn_ones = Patterns(np.zeros((0, 40)), rng.normal(0.0, np.sqrt(1.0 + variances)), variances)
+    sizes = [drawn_ones.sizes(nothing, np.diag(variances), nothing, absent=absent) for absent in (False, True)]
+    assert sizes[0].strength > 0.3 > 0.0 == sizes[1].strength
+    assert sizes[1].figure == pytest.approx(1.0, rel=0.4)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("rms", "least", "most"), [(0.0, 25.0, 40.0), (3.0, 60.0, 250.0)])
 def test_well_figured_telescopes_claim_less(behind_focus, rms, least, most):
@@ -245,6 +258,8 @@ def test_well_figured_telescopes_claim_less(behind_focus, rms, least, most):
     image = noisy(donut(behind_focus, FIELD, zernikes=wave, rays=400), SKY, 2)
     fit = pachon.fit_donuts(behind_focus, [image], [FIELD], WAVELENGTH, sky_variance=SKY, **OPTIONS)
     assert least < 1e9 * np.sqrt(np.trace(fit.covariance[0])) < most
+    # The model says that there is no air.
+    assert not fit.error_parts.air.any()
     assert fit.zernikes[0] @ np.linalg.solve(fit.covariance[0], fit.zernikes[0]) / 19 < 1.5
 
 
@@ -344,6 +359,14 @@ def wavefronts(case, rng):
     return waves[:, 3:22], seen
 
 
+def in_seeing(image):
+    """Image through a long exposure of :data:`SEEING`, of pixels of the telescope's scale; zeros around it."""
+    size, seeing = 4 * len(image), Seeing(WAVELENGTH, 25.0)
+    frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)) / (PIXEL / FOCAL_LENGTH)
+    transfer = np.exp(-(seeing.strength(SEEING) ** (5.0 / 3.0)) * seeing.exponent(WAVELENGTH * frequency))
+    return np.fft.irfft2(transfer * np.fft.rfft2(image, (size, size)), (size, size))[: len(image), : len(image)]
+
+
 @pytest.fixture(scope="module")
 def lights(behind_focus):
     """Light of donuts by the kind of a case: fields, true wavefronts and images, drawn once."""
@@ -364,7 +387,8 @@ def lights(behind_focus):
             angle = rng.uniform(0.0, 2.0 * np.pi)
             field = np.deg2rad(radius * np.array([np.cos(angle), np.sin(angle)]))
             telescope, shift = vignetting if kind == "chord" else behind_focus, rng.uniform(-0.5, 0.5, 2)
-            donuts.append((field, true, donut(telescope, field, zernikes=seen, rays=500, flux=2e6, shift=shift)))
+            image = donut(telescope, field, zernikes=seen, rays=500, flux=2e6, shift=shift)
+            donuts.append((field, true, in_seeing(image) if kind == "air unknown" else image))
         return donuts
 
     return of_kind
@@ -378,6 +402,7 @@ def test_calibration(behind_focus, lights, case):
     model = replace(BLUR, rims=pachon.sensing.DonutRims(search=case != "chord, not searched"))
     squares, variances, chi2 = [], [], []
     kind = next((kind for kind in ("chord", "air unknown") if case.startswith(kind)), "")
+    model = replace(model, air=pachon.DonutAir()) if kind == "air unknown" else model
     for (field, true, light), _ in itertools.product(lights(kind), range(1 if kind == "air unknown" else N_NOISE)):
         noise = rng.normal(size=light.shape)
         if case == "correlated noise":
