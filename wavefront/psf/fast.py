@@ -67,9 +67,11 @@ LEAST_SAMPLES = 4
 OVERSAMPLING = 2
 #: Cells per pixel by default, without an atmosphere: an undisturbed spot may be no larger than a quarter of a pixel.
 OVERSAMPLING_STILL = 12
-#: Largest cell over the width of an image, and most cells per pixel: pixels as wide as the seeing need more cells.
-#: Cells of half of the width would make the brightest pixel 5 % too bright, of 1.5 widths 44 %; of 0.33, 0.25 %.
-LARGEST_CELL, MOST_CELLS = 0.3, 32
+#: Largest cell over the width of an image: pixels as wide as the seeing need more cells. Cells of half of the width
+#: would make the brightest pixel 5 % too bright, of 1.5 widths 44 %; of 0.33, 0.25 %.
+LARGEST_CELL = 0.3
+#: Most cells per pixel by default.
+MOST_CELLS = 32
 #: The same over the width without charge diffusion: rays that share one cell are taken for its middle.
 LARGEST_CELL_OF_RAYS = 0.5
 #: Distance on the CCD of the rays of neighbouring pupil points [pixels], with an atmosphere, beyond which a star counts
