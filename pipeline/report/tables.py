@@ -64,7 +64,7 @@ def headline(summary: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def verdict(summary: dict[str, Any]) -> str:
-    """Return the result of a run in one sentence."""
+    """Return the result of a run in one sentence, with another one where few PSFs have a g."""
     metrics, lost = summary["all"], len(summary["not_modelled"])
     where = "On one CCD" if metrics["ccds"] == 1 else f"On {metrics['ccds']} CCDs"
     width = f'{metrics["fwhm_arcsec"]:.3g}" wide' if math.isfinite(metrics["fwhm_arcsec"]) else "of unknown width"
@@ -78,9 +78,15 @@ def verdict(summary: dict[str, Any]) -> str:
     mean, residual, scatter = (_percent(metrics[key]) for key in keys[name])
     constant = "a constant PSF" if metrics["ccds"] == 1 else "a constant PSF on each CCD"
     left_out = f"; {lost} {'CCD' if lost == 1 else 'CCDs'} could not be modelled" if lost else ""
+    sharp = (
+        ""
+        if measured or not metrics["truth_psfs_with_g"]
+        else f" Only {metrics['truth_psfs_with_g']} of {metrics['truth_psfs']} noise-free PSFs have adaptive moments, "
+        "which images narrower than 2 pixels often lack; figures of g are those of the few."
+    )
     return (
         f"{where} the PSF is {width} with a mean ellipticity |{name}| of {mean}; where no star is, its model errs by "
-        f"{residual} in {name}, against {scatter} of {constant}{left_out}."
+        f"{residual} in {name}, against {scatter} of {constant}{left_out}.{sharp}"
     )
 
 
