@@ -52,9 +52,9 @@ def run_summary(ccds=9, lost=(), **changes):
         (
             run_summary(truth_psfs_with_g=880, mean_g_truth=0.17),
             'On 9 CCDs the PSF is 0.684" wide with a mean ellipticity |weighted e| of 1.10 %; where no star is, its '
-            "model errs by 0.20 % in weighted e, against 0.45 % of a constant PSF on each CCD. Only 880 of 900 noise-free "
-            "PSFs have adaptive moments, which images narrower than 2 pixels often lack; figures of g are those of the "
-            "few.",
+            "model errs by 0.20 % in weighted e, against 0.45 % of a constant PSF on each CCD. Only 880 of 900 "
+            "noise-free PSFs have adaptive moments, which images narrower than 2 pixels often lack; figures of g are "
+            "those of the few.",
         ),
     ],
 )
