@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.errors import ConfigError, DomainError
+from ..core.errors import ConfigError, DomainError, PachonError
 from ..core.plotting import BLUE, ORANGE, figure_at, plain_text, styled
 from ..core.result import Result
+from ..core.units import pure_numbers
 from ..design.optimize.jacobian import ParameterColumns
 from ..design.optimize.sensitivity import sensitivity
 from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
@@ -225,21 +226,33 @@ def prior_spreads(
 ) -> np.ndarray:
     """Return standard deviations of the degrees of freedom, each in its unit, shape [n].
 
-    ``prior`` holds them as a vector, by name, or as tolerances; by default each degree of freedom makes a wavefront of
-    1 um rms over the field.
+    ``prior`` is as in :func:`stated_spreads`; by default each degree of freedom makes a wavefront of 1 um rms over the
+    field.
     """
     if prior is None:
         return np.asarray(DEFAULT_PRIOR / sensitivity(telescope, freedoms, wavelength=wavelength).rms)
+    return stated_spreads(freedoms, prior)
+
+
+def stated_spreads(
+    freedoms: DegreesOfFreedom, prior: ArrayLike | Mapping[str, Any] | Sequence[Tolerance]
+) -> np.ndarray:
+    """Return standard deviations that are one number, a vector, by name, or of tolerances, as [n], each in its unit."""
     if isinstance(prior, Sequence) and prior and isinstance(prior[0], Tolerance):
         prior = {t.name: t.spread for t in prior if isinstance(t, Tolerance)}
     if isinstance(prior, Mapping):
         by_name: Any = prior
-        spreads = freedoms.vector(by_name)
-    else:
         try:
-            spreads = np.array(np.broadcast_to(np.asarray(prior, dtype=np.float64), (len(freedoms),)))
-        except (TypeError, ValueError):
-            raise ConfigError(f"prior: expected {len(freedoms)} standard deviations, or them by name") from None
+            spreads = freedoms.vector(by_name)
+        except PachonError as error:
+            raise error.within(key="prior") from None
+    else:
+        numbers = pure_numbers(prior, "prior")
+        if numbers.shape not in ((), (1,), (len(freedoms),)):
+            raise ConfigError(
+                f"prior of shape {list(numbers.shape)}: expected {len(freedoms)} standard deviations, or them by name"
+            )
+        spreads = np.array(np.broadcast_to(numbers, (len(freedoms),)))
     for name, value in zip(freedoms.names, spreads, strict=True):
         if not (np.isfinite(value) and value > 0.0):
             raise DomainError(f"prior of {name} = {float(value)!r}: expected a positive standard deviation")
