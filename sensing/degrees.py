@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 #: Rms wavefront over the field that each degree of freedom may make where no prior is given [m].
 DEFAULT_PRIOR = 1e-6
+#: Rms wavefront of a degree of freedom in SI, in metres per unit of it, that is none but rounding.
+_SILENT = 1e-12
 #: Combinations drawn in a plot.
 _SHOWN = 12
 
@@ -227,10 +229,14 @@ def prior_spreads(
     """Return standard deviations of the degrees of freedom, each in its unit, shape [n].
 
     ``prior`` is as in :func:`stated_spreads`; by default each degree of freedom makes a wavefront of 1 um rms over the
-    field.
+    field, and DomainError where one makes none.
     """
     if prior is None:
-        return np.asarray(DEFAULT_PRIOR / sensitivity(telescope, freedoms, wavelength=wavelength).rms)
+        rms = sensitivity(telescope, freedoms, wavelength=wavelength).rms
+        silent = [name for name, slope in zip(freedoms.names, rms / freedoms.unit_sizes, strict=True) if slope < _SILENT]
+        if silent:
+            raise DomainError(f"{', '.join(silent)}: no change of the wavefront; expected other freedoms, or their prior")
+        return np.asarray(DEFAULT_PRIOR / rms)
     return stated_spreads(freedoms, prior)
 
 
