@@ -233,9 +233,9 @@ def prior_spreads(
     """
     if prior is None:
         rms = sensitivity(telescope, freedoms, wavelength=wavelength).rms
-        silent = [name for name, slope in zip(freedoms.names, rms / freedoms.unit_sizes, strict=True) if slope < _SILENT]
-        if silent:
-            raise DomainError(f"{', '.join(silent)}: no change of the wavefront; expected other freedoms, or their prior")
+        if (silent := rms < _SILENT * freedoms.unit_sizes).any():
+            names = ", ".join(np.array(freedoms.names)[silent])
+            raise DomainError(f"{names}: no change of the wavefront; expected other freedoms, or their prior")
         return np.asarray(DEFAULT_PRIOR / rms)
     return stated_spreads(freedoms, prior)
 

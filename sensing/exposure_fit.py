@@ -149,7 +149,7 @@ class ExposureDonuts(WavefrontFit):
         zernikes = np.array([star.solution.shared[:n] for star in usable.stars]).reshape(count, n)
         errors = [star_errors(instrument, star) for star in usable.stars]
         covariance = np.array([star.of_light for star in errors]).reshape(count, n, n)
-        if count < 2:
+        if count < 2 and (self.freedoms is None or not count):
             return FittedStars(_results(usable, errors, zernikes, np.array([star.parts.total for star in errors])))
         behind = np.array([star.light.depth > 0.0 for star in usable.stars])
         star = self._stars(usable.every_field)[usable.index]

@@ -6,7 +6,9 @@ from astropy import units as u
 
 import pachon
 from pachon.core.errors import PachonError
+from pachon.models.parameters.degrees_of_freedom import DegreesOfFreedom
 from pachon.sensing import ExposureDonuts, TelescopeFreedoms
+from pachon.sensing.degrees import prior_spreads
 
 FREEDOMS = pachon.load_degrees_of_freedom("lsst").select(["M2_dz", "M2_rx"])
 
@@ -36,3 +38,12 @@ def test_priors():
         TelescopeFreedoms(FREEDOMS, prior=prior)
     with pytest.raises(PachonError, match="prior: expected together with freedoms"):
         ExposureDonuts(prior=5.0)
+
+
+def test_a_freedom_without_a_wavefront_has_no_default_prior():
+    """A turn of M2 about its axis had an infinite prior, and errors of 4e12 arcsec or a raw error of linear algebra."""
+    telescope = pachon.load_telescope("lsst_v3.3_r")
+    freedoms = DegreesOfFreedom.of_parameters(telescope, ["M2.dz", "M2.rz"])
+    with pytest.raises(PachonError, match=r"^M2\.rz: no change of the wavefront; expected"):
+        prior_spreads(freedoms, None, telescope, 622e-9)
+    assert np.isfinite(prior_spreads(freedoms.select(["M2.dz"]), None, telescope, 622e-9)).all()
