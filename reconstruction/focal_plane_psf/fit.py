@@ -76,6 +76,10 @@ class ShapeData:
     def __len__(self) -> int:
         return len(self.values)
 
+    def chosen(self, which: np.ndarray) -> ShapeData:
+        """Return the shapes of some stars."""
+        return ShapeData(self.places[which], self.values[which], self.noise[which])
+
 
 @dataclass(frozen=True, eq=False)
 class OpticsFit:
