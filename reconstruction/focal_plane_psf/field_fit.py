@@ -14,23 +14,17 @@ from ...models.camera.cameras import load_camera
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import BudgetName, HeightBudget
 from ...models.telescope import Telescope
+from .consistent_stars import LEAST_STARS, fit_statistics
 from .field import ShapeField
 from .fit import SHAPES, ExposureFit, ShapeData, Turbulence
 from .heights import HeightPrior
-from .kriging import map_on_threads
-from .likelihood import CovarianceFit, fit_covariance, log_likelihood
+from .likelihood import log_likelihood
 from .mosaic import Mosaic
 from .optics_part import OpticsPart
 from .response import Instrument
 from .stars import FocalPlaneStars
 from .static_heights import StaticHeights
 
-#: Fewest stars of a fit.
-LEAST_STARS = 30
-# Typical deviations beyond which a star is none. Optics alone make 6 to 12 at the rims of bent CCDs out of focus.
-_CLIP_SIGMA = 15.0
-# Part of the stars that are kept at least, whatever the others say.
-_LEAST_PART = 0.7
 # Steps of the covariance without optics, of which only the likelihood is used where there is a telescope.
 _ROUGH = 12
 
@@ -69,7 +63,7 @@ def fit_field(
 ) -> FittedField:
     """Fit covariances and, with an instrument and a prior of the heights, heights and alignment."""
     with reporter.stage("covariance without optics"):
-        statistics, consistent = _fit_statistics(mosaic, data, 30 if instrument is None else _ROUGH, threads)
+        statistics, consistent = fit_statistics(mosaic, data, 30 if instrument is None else _ROUGH, threads)
         data = data.chosen(consistent)
     if instrument is None or prior is None:
         bounds = tuple(f"{n} of {SHAPES[i]}" for i, fit in enumerate(statistics) for n in fit.at_bounds)
@@ -92,34 +86,6 @@ def fit_field(
     design = optics.design_of(data.places, slopes, columns)
     field = ShapeField(mosaic, data, residuals, tuple(fit.covariances), optics, design)
     return FittedField(field, consistent, evidence, fit.at_bounds)
-
-
-def _fit_statistics(
-    mosaic: Mosaic, data: ShapeData, steps: int, threads: int | None
-) -> tuple[list[CovarianceFit], np.ndarray]:
-    """Fit covariances of the shapes of stars, without optics, and return the stars that do not contradict them [n].
-
-    A galaxy scatters tenfold as much as a star, and would be taken for scatter of all stars.
-    """
-    consistent = np.ones(len(data), dtype=bool)
-    while True:
-        stars = data.chosen(consistent)
-
-        def of_shape(shape: int, stars: ShapeData = stars) -> CovarianceFit:
-            values, noise = stars.values[:, shape], stars.noise[:, shape]
-            return fit_covariance(stars.places, values, noise, with_ccds=True, max_iterations=steps)
-
-        fits: list[CovarianceFit] = map_on_threads(of_shape, range(3), threads)
-        field = ShapeField(mosaic, stars, stars.values, tuple(f.covariance for f in fits))
-        good = field.inliers(threads, sigma=_CLIP_SIGMA, least=0.0)
-        if good.all() or good.sum() < max(LEAST_STARS, _LEAST_PART * len(data)):
-            break
-        consistent[np.flatnonzero(consistent)[~good]] = False
-    left_out = np.flatnonzero(~consistent)
-    if len(left_out):
-        # Neighbours of galaxies seemed to be wrong, too.
-        consistent[left_out] = field.agrees_with(data.chosen(left_out), threads)
-    return fits, consistent
 
 
 def mosaic_of(

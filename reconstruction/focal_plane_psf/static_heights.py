@@ -36,6 +36,7 @@ from ...models.camera.ccd_surfaces import CcdSurfaces
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ..gaussian_field import inverse_from_cholesky
+from .consistent_stars import LEAST_STARS, fit_statistics
 from .fit import ExposureFit, ShapeData
 from .height_equations import ExposureState, HeightEquations
 from .heights import STATIC_DEGREE, HeightPrior
@@ -50,6 +51,8 @@ if TYPE_CHECKING:
 
 #: Gauss-Newton steps about the heights of all exposures.
 STEPS = 3
+# Steps of the covariances with which galaxies among the stars are found.
+_ROUGH = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,13 +259,16 @@ class _ExposureJob:
             )
         stars = stars.chosen(usable)
         instrument = self._under_weight(stars.weight_fwhm, number).with_rotator(stars.rotator)
-        places = places_of(Mosaic.of_camera(self.prior.camera), stars)
+        mosaic = Mosaic.of_camera(self.prior.camera)
+        places = places_of(mosaic, stars)
         data = ShapeData(places, stars.values, stars.noise**2)
         key = self._key(data, state, instrument)
         path = None if self.folder is None else self.folder / f"exposure_{number:05d}_step_{step}.npz"
         saved_equations = None if path is None else HeightEquations.read(path, key)
         if saved_equations is not None:
             return saved_equations
+        if len(data) >= LEAST_STARS:
+            data = data.chosen(fit_statistics(mosaic, data, _ROUGH, self.threads)[1])
         fit = ExposureFit(data, instrument, self.prior, self.alignment_rms, self.threads, Reporter(quiet=True))
         # What heights may still be off by is no turbulence that the residuals lack.
         fit.heights, fit.ccd_covariance = self.heights.copy(), self.ccd_covariance
