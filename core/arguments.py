@@ -351,6 +351,7 @@ def _sequence_check(kind: Any, elements: tuple[Any, ...]) -> _Check:
     checks = [_annotation_check(element) for element in elements if element is not Ellipsis] or [None]
     expected = f"a sequence of {len(checks)}" if fixed else "a sequence"
     simple = {element for element in elements if element is not Ellipsis}
+    numeric = bool(simple) and simple <= {int, float}
     simple = simple if kind is tuple and len(simple) == 1 and get_origin(*simple) is None else set()
 
     def check(name: str, value: Any) -> Any:
@@ -372,6 +373,8 @@ def _sequence_check(kind: Any, elements: tuple[Any, ...]) -> _Check:
         if not isinstance(value, (list, tuple, np.ndarray)):
             # An iterator can be used once only.
             return value
+        if numeric and isinstance(value, np.ndarray) and value.dtype.kind == "O":
+            raise _MismatchError(name, value, f"{expected} of numbers")
         if len(value) > _MOST_ELEMENTS:
             raise _MismatchError(name, value, f"{expected} of at most {_MOST_ELEMENTS}")
         if fixed and len(value) != len(checks):

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.errors import ConfigError, DomainError
+from ..core.errors import ConfigError, DomainError, PachonError
 from ..core.plotting import BLUE, ORANGE, figure_at, plain_text, styled
 from ..core.result import Result
+from ..core.units import pure_numbers
 from ..design.optimize.jacobian import ParameterColumns
 from ..design.optimize.sensitivity import sensitivity
 from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 
 #: Rms wavefront over the field that each degree of freedom may make where no prior is given [m].
 DEFAULT_PRIOR = 1e-6
+#: Rms wavefront of a degree of freedom in SI, in metres per unit of it, that is none but rounding.
+_SILENT = 1e-12
 #: Combinations drawn in a plot.
 _SHOWN = 12
 
@@ -225,21 +228,37 @@ def prior_spreads(
 ) -> np.ndarray:
     """Return standard deviations of the degrees of freedom, each in its unit, shape [n].
 
-    ``prior`` holds them as a vector, by name, or as tolerances; by default each degree of freedom makes a wavefront of
-    1 um rms over the field.
+    ``prior`` is as in :func:`stated_spreads`; by default each degree of freedom makes a wavefront of 1 um rms over the
+    field, and DomainError where one makes none.
     """
     if prior is None:
-        return np.asarray(DEFAULT_PRIOR / sensitivity(telescope, freedoms, wavelength=wavelength).rms)
+        rms = sensitivity(telescope, freedoms, wavelength=wavelength).rms
+        if (silent := rms < _SILENT * freedoms.unit_sizes).any():
+            names = ", ".join(np.array(freedoms.names)[silent])
+            raise DomainError(f"{names}: no change of the wavefront; expected other freedoms, or their prior")
+        return np.asarray(DEFAULT_PRIOR / rms)
+    return stated_spreads(freedoms, prior)
+
+
+def stated_spreads(
+    freedoms: DegreesOfFreedom, prior: ArrayLike | Mapping[str, Any] | Sequence[Tolerance]
+) -> np.ndarray:
+    """Return standard deviations that are one number, a vector, by name, or of tolerances, as [n], each in its unit."""
     if isinstance(prior, Sequence) and prior and isinstance(prior[0], Tolerance):
         prior = {t.name: t.spread for t in prior if isinstance(t, Tolerance)}
     if isinstance(prior, Mapping):
         by_name: Any = prior
-        spreads = freedoms.vector(by_name)
-    else:
         try:
-            spreads = np.array(np.broadcast_to(np.asarray(prior, dtype=np.float64), (len(freedoms),)))
-        except (TypeError, ValueError):
-            raise ConfigError(f"prior: expected {len(freedoms)} standard deviations, or them by name") from None
+            spreads = freedoms.vector(by_name)
+        except PachonError as error:
+            raise error.within(key="prior") from None
+    else:
+        numbers = pure_numbers(prior, "prior")
+        if numbers.shape not in ((), (1,), (len(freedoms),)):
+            raise ConfigError(
+                f"prior of shape {list(numbers.shape)}: expected {len(freedoms)} standard deviations, or them by name"
+            )
+        spreads = np.array(np.broadcast_to(numbers, (len(freedoms),)))
     for name, value in zip(freedoms.names, spreads, strict=True):
         if not (np.isfinite(value) and value > 0.0):
             raise DomainError(f"prior of {name} = {float(value)!r}: expected a positive standard deviation")

@@ -19,7 +19,7 @@ from ..models.parameters.tolerances import Tolerance
 from ..models.telescope import Telescope
 from ..wavefront.atmosphere.atmosphere import Atmosphere
 from .contradicting_donuts import Consistent, fit_consistently, without
-from .degrees import FreedomEstimate, prior_spreads
+from .degrees import FreedomEstimate, prior_spreads, stated_spreads
 from .exposure import ExposureWavefront
 from .fit_star import StarFit
 from .hierarchy import Basis, ExposureAir, Observations, fit_hierarchy, star_numbers
@@ -77,8 +77,8 @@ class ExposureDonuts(WavefrontFit):
 
     Raises
     ------
-    DomainError
-        If indices repeat or are too low, or a number is outside its range.
+    ConfigError, DomainError
+        If indices repeat or are too low, a number is outside its range, or there is a prior without freedoms.
     """
 
     joint: ClassVar[bool] = False
@@ -94,6 +94,10 @@ class ExposureDonuts(WavefrontFit):
         for name, least in (("field_noll", 1), ("noll", 4)):
             object.__setattr__(self, name, tuple(noll_indices(getattr(self, name), name, least)))
         small_length(self.higher_order, "higher_order")
+        if self.prior is not None:
+            if self.freedoms is None:
+                raise DomainError("prior: expected together with freedoms")
+            stated_spreads(self.freedoms, self.prior)
 
     def terms(self, telescope: Telescope, atmosphere: Atmosphere | None) -> WavefrontTerms:
         """Return the terms of the wavefront of each star, those of :class:`SingleDonuts`."""
@@ -145,7 +149,7 @@ class ExposureDonuts(WavefrontFit):
         zernikes = np.array([star.solution.shared[:n] for star in usable.stars]).reshape(count, n)
         errors = [star_errors(instrument, star) for star in usable.stars]
         covariance = np.array([star.of_light for star in errors]).reshape(count, n, n)
-        if count < 2:
+        if count < 2 and (self.freedoms is None or not count):
             return FittedStars(_results(usable, errors, zernikes, np.array([star.parts.total for star in errors])))
         behind = np.array([star.light.depth > 0.0 for star in usable.stars])
         star = self._stars(usable.every_field)[usable.index]

@@ -18,7 +18,7 @@ from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ..models.parameters.tolerances import Tolerance
 from ..raytrace.launch import aimed_points
 from ..wavefront.psf.pupil_rims import pupil_rims
-from .degrees import FreedomEstimate, FreedomRays, prior_spreads
+from .degrees import FreedomEstimate, FreedomRays, prior_spreads, stated_spreads
 from .fit_star import StarFit
 from .inputs import noll_indices
 from .joint_errors import joint_errors
@@ -61,15 +61,15 @@ class TelescopeFreedoms(WavefrontFit):
     freedoms : DegreesOfFreedom
         Degrees of freedom, in place of Zernikes of each donut.
     prior : array_like, mapping or tolerances, optional
-        Standard deviations of the degrees of freedom, each in its unit; by default each makes 1 um rms of wavefront
-        over the field.
+        Standard deviations of the degrees of freedom, each in its unit, or one number for all; by default each makes
+        1 um rms of wavefront over the field.
     noll : iterable of int
         Noll indices of the wavefront that they make at each donut, from 4.
 
     Raises
     ------
-    DomainError
-        If indices repeat or are below 4.
+    ConfigError, DomainError
+        If indices repeat or are below 4, or a standard deviation is missing or not positive.
     """
 
     freedoms: DegreesOfFreedom
@@ -78,6 +78,8 @@ class TelescopeFreedoms(WavefrontFit):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "noll", tuple(noll_indices(self.noll, "noll", 4)))
+        if self.prior is not None:
+            stated_spreads(self.freedoms, self.prior)
 
     def prepared(self, instrument: Instrument, star: StarFit) -> StarFit:
         """Return a star whose light depends on degrees of freedom in place of its own Zernikes."""

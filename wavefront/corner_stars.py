@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
+from ..core.errors import DomainError
 from ..core.point_plots import draw_points
 from ..core.result import Result
 from ..core.units import length, require_count
@@ -127,4 +128,11 @@ def corner_stars(
     positions = np.stack(camera.from_local(np.arange(len(camera))[:, None], *np.moveaxis(inner, -1, 0)), axis=-1)
     positions = positions.reshape(-1, 2)
     sensors = tuple(name for name in camera.ccd_names for _ in range(n))
-    return CornerStars(telescope, plane, sensors, positions, fields_at(telescope, positions, light))
+    fields = fields_at(telescope, positions, light)
+    distance = float(np.hypot(*fields.T).max())
+    if distance > telescope.field_limit * (1.0 + 1e-12):
+        raise DomainError(
+            f"sensors of the LSST camera up to {np.rad2deg(distance):.4g} deg from the axis: expected a telescope of "
+            f"such a field; that of {telescope.name} ends at {np.rad2deg(telescope.field_limit):.4g} deg"
+        )
+    return CornerStars(telescope, plane, sensors, positions, fields)

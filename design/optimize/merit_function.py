@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, shown
+from ...core.units import metres
 from ...models.telescope import Telescope
 from ..metrics.spots import SpotReference, spot_diagram
 from .merit import Beams, Merit, SpotMerit, WavefrontMerit
@@ -74,7 +75,7 @@ class WavefrontError:
 
     Parameters
     ----------
-    goal : array_like, shape [n_field, n_wave, n_pupil], optional
+    goal : array_like or Quantity, shape [n_field, n_wave, n_pupil], optional
         Target wavefronts [m] of one telescope, such as those of :func:`~.optimize.wavefronts`: NaN where no light
         passes; zero by default.
     """
@@ -84,11 +85,15 @@ class WavefrontError:
     goal: ArrayLike | None = None
 
     def __post_init__(self) -> None:
-        if self.goal is not None and (np.ndim(self.goal) != 3 or np.size(self.goal) > _MOST_RAYS):
+        if self.goal is None:
+            return
+        goal = metres(self.goal, "goal")
+        if goal.ndim != 3 or goal.size > _MOST_RAYS:
             raise DomainError(
-                f"goal has shape {np.shape(self.goal)}: expected [n_field, n_wave, n_pupil], at most {_MOST_RAYS} rays",
+                f"goal has shape {goal.shape}: expected [n_field, n_wave, n_pupil], at most {_MOST_RAYS} rays",
                 key="goal",
             )
+        object.__setattr__(self, "goal", goal)
 
     @property
     def of_one_telescope(self) -> bool:

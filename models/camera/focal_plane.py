@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError
+from ...core.errors import DomainError, UnknownNameError
 from ...core.number_text import counted
 from ...core.units import metres, plane_points, radians, require_count
 from .camera import Camera
@@ -260,7 +260,10 @@ class FocalPlane(HeightMap):
             residual = None if self.residual is None else abs(factors) * self.residual
             surfaces = self.surfaces.scaled(factors)
             return replace(self, surfaces=surfaces, residual=residual, terms=(), budget=None, seed=None)
-        chosen_terms(by_term)
+        try:
+            chosen_terms(by_term)
+        except UnknownNameError as error:
+            raise error.within(key="factors") from None
         if self.budget is None or self.seed is None:
             raise DomainError("factors of terms: expected a focal plane drawn from a height budget")
         parts = [

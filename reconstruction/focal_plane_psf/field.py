@@ -27,6 +27,8 @@ from .response import N_EXPOSURE
 
 #: Stars that deviate by more standard deviations from the prediction of all others are left out.
 CLIP_SIGMA = 6.0
+#: Standard deviations within which one that was left out is a star after all: one in 5000 good ones is not.
+AGREEING_SIGMA = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +60,10 @@ class ShapeField:
 
     def with_stars(self, which: np.ndarray) -> ShapeField:
         """Return the field restricted to some of its stars."""
-        data = ShapeData(self.data.places[which], self.data.values[which], self.data.noise[which])
         design = None if self.design is None else self.design[which]
-        return ShapeField(self.mosaic, data, self.residuals[which], self.covariances, self.optics, design)
+        return ShapeField(
+            self.mosaic, self.data.chosen(which), self.residuals[which], self.covariances, self.optics, design
+        )
 
     def predict(
         self, places: Places, *, variance: bool = False, threads: int | None = None
@@ -169,8 +172,18 @@ class ShapeField:
             residuals[at], variance[at] = difference, spread
         return residuals, variance
 
-    def inliers(self, threads: int | None = None) -> np.ndarray:
-        """Return the stars within :data:`CLIP_SIGMA` of the prediction from the others of their block, [n] bool."""
+    def agrees_with(self, stars: ShapeData, threads: int | None = None) -> np.ndarray:
+        """Return which of other stars lie within :data:`AGREEING_SIGMA` of the prediction, [n] bool."""
+        predicted, variance = self.predict(stars.places, variance=True, threads=threads)
+        assert variance is not None
+        spread = AGREEING_SIGMA * np.sqrt(variance + stars.noise)
+        return np.asarray((np.abs(stars.values - predicted) < spread).all(axis=1))
+
+    def inliers(self, threads: int | None = None, *, sigma: float = CLIP_SIGMA, least: float = 1.0) -> np.ndarray:
+        """Return the stars within `sigma` typical deviations of the prediction from others of their block, [n] bool.
+
+        `least` is the least typical deviation over that expected.
+        """
         data = self.data
 
         def job(index: np.ndarray) -> np.ndarray:
@@ -184,5 +197,5 @@ class ShapeField:
         deviation = np.empty((len(data), 3))
         for index, values in zip(blocks, map_on_threads(job, blocks, threads), strict=True):
             deviation[index] = values
-        typical = np.maximum(RMS_PER_MAD * np.median(np.abs(deviation), axis=0), 1.0)
-        return np.asarray((np.abs(deviation) < CLIP_SIGMA * typical).all(axis=1))
+        typical = np.maximum(RMS_PER_MAD * np.median(np.abs(deviation), axis=0), least)
+        return np.asarray((np.abs(deviation) < sigma * typical).all(axis=1))

@@ -14,19 +14,17 @@ from ...models.camera.cameras import load_camera
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import BudgetName, HeightBudget
 from ...models.telescope import Telescope
+from .consistent_stars import LEAST_STARS, fit_statistics
 from .field import ShapeField
 from .fit import SHAPES, ExposureFit, ShapeData, Turbulence
 from .heights import HeightPrior
-from .kriging import map_on_threads
-from .likelihood import CovarianceFit, fit_covariance, log_likelihood
+from .likelihood import log_likelihood
 from .mosaic import Mosaic
 from .optics_part import OpticsPart
 from .response import Instrument
 from .stars import FocalPlaneStars
 from .static_heights import StaticHeights
 
-#: Fewest stars of a fit.
-LEAST_STARS = 30
 # Steps of the covariance without optics, of which only the likelihood is used where there is a telescope.
 _ROUGH = 12
 
@@ -39,6 +37,8 @@ class FittedField:
     ----------
     field : ShapeField
         The field.
+    consistent : ndarray of bool, shape [n]
+        Stars that the others do not contradict, those of the field.
     evidence : float
         Logarithm of the likelihood with the telescope over that without; NaN without a telescope.
     at_bounds : tuple of str
@@ -46,6 +46,7 @@ class FittedField:
     """
 
     field: ShapeField
+    consistent: np.ndarray
     evidence: float
     at_bounds: tuple[str, ...]
 
@@ -61,19 +62,13 @@ def fit_field(
     reporter: Reporter,
 ) -> FittedField:
     """Fit covariances and, with an instrument and a prior of the heights, heights and alignment."""
-
-    def alone(shape: int) -> CovarianceFit:
-        steps = 30 if instrument is None else _ROUGH
-        values, noise = data.values[:, shape], data.noise[:, shape]
-        return fit_covariance(data.places, values, noise, with_ccds=True, max_iterations=steps)
-
     with reporter.stage("covariance without optics"):
-        statistics: list[CovarianceFit] = map_on_threads(alone, range(3), threads)
+        statistics, consistent = fit_statistics(mosaic, data, 30 if instrument is None else _ROUGH, threads)
+        data = data.chosen(consistent)
     if instrument is None or prior is None:
         bounds = tuple(f"{n} of {SHAPES[i]}" for i, fit in enumerate(statistics) for n in fit.at_bounds)
-        return FittedField(
-            ShapeField(mosaic, data, data.values, tuple(s.covariance for s in statistics)), np.nan, bounds
-        )
+        field = ShapeField(mosaic, data, data.values, tuple(s.covariance for s in statistics))
+        return FittedField(field, consistent, np.nan, bounds)
     fit = ExposureFit(data, instrument, prior, alignment_rms, threads, reporter)
     solution = fit.run(turbulence)
     with one_blas_thread():
@@ -90,7 +85,7 @@ def fit_field(
     residuals = data.values - optics.shapes(data.places, threads)
     design = optics.design_of(data.places, slopes, columns)
     field = ShapeField(mosaic, data, residuals, tuple(fit.covariances), optics, design)
-    return FittedField(field, evidence, fit.at_bounds)
+    return FittedField(field, consistent, evidence, fit.at_bounds)
 
 
 def mosaic_of(

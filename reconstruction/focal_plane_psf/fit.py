@@ -76,6 +76,10 @@ class ShapeData:
     def __len__(self) -> int:
         return len(self.values)
 
+    def chosen(self, which: np.ndarray) -> ShapeData:
+        """Return the shapes of some stars."""
+        return ShapeData(self.places[which], self.values[which], self.noise[which])
+
 
 @dataclass(frozen=True, eq=False)
 class OpticsFit:
@@ -170,6 +174,9 @@ class ExposureFit:
         self.covariances: Sequence[Covariance | LayerCovariance] = []
         self.at_bounds: tuple[str, ...] = ()
         self.covariance: np.ndarray | None = None
+        #: Covariance of the heights of each CCD in its own terms, in place of `covariance`, [n_ccd, n_term, n_term].
+        self.ccd_covariance: np.ndarray | None = None
+        self._exposure_covariance = np.zeros((N_EXPOSURE, N_EXPOSURE))
         self._log_determinant = 0.0
         self._response: ExposureResponse | None = None
 
@@ -217,7 +224,8 @@ class ExposureFit:
             matrix += block.matrix[-N_EXPOSURE:, -N_EXPOSURE:]
             vector += block.vector[-N_EXPOSURE:]
         scale = 1.0 / np.sqrt(np.diagonal(matrix))
-        change = scale * np.linalg.solve(matrix * scale[:, None] * scale, scale * vector)
+        self._exposure_covariance = np.linalg.inv(matrix * scale[:, None] * scale) * scale[:, None] * scale
+        change = self._exposure_covariance @ vector
         self.exposure = self.exposure + change
         # The model is linear in them.
         return [b._replace(vector=b.vector - b.matrix[:, -N_EXPOSURE:] @ change) for b in blocks]
@@ -249,14 +257,13 @@ class ExposureFit:
             def spread(index: np.ndarray) -> np.ndarray:
                 used, terms = self._terms(index)
                 design = _design_columns(terms, slopes[index, shape], columns[index, :, shape])
-                assert self.covariance is not None
-                return design @ self.covariance[np.ix_(used, used)] @ design.T
+                return design @ self._covariance_of(used, index) @ design.T
 
             return fit_covariance(
                 self.data.places,
                 residuals[:, shape],
                 self.data.noise[:, shape],
-                spread=spread if self.covariance is not None else None,
+                spread=None if self.covariance is None and self.ccd_covariance is None else spread,
                 start=covariances[shape] if covariances else None,
                 constant=_MEAN[shape] ** 2,
                 max_iterations=max_iterations,
@@ -319,6 +326,15 @@ class ExposureFit:
             first = prior.n_common + i * width
             terms[rows, first : first + width] = self.own[index][rows]
         return used, terms
+
+    def _covariance_of(self, used: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """Return the covariance of the parameters that act on some stars."""
+        if self.covariance is not None:
+            return self.covariance[np.ix_(used, used)]
+        assert self.ccd_covariance is not None
+        ccds = np.unique(self.data.places.ccd[index])
+        common = np.zeros((self.prior.n_common,) * 2)
+        return scipy.linalg.block_diag(common, *self.ccd_covariance[ccds], self._exposure_covariance)
 
     def block_equations(self) -> list[BlockEquations]:
         """Return the normal equations of each block of stars in a change of the parameters, without priors."""

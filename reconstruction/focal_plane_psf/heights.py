@@ -22,8 +22,10 @@ from .covariance import Places
 DEGREE = 4
 #: ... and for many: of a potato chip of 1 to 2 cycles 6 leaves 0.3 um.
 STATIC_DEGREE = 6
-# Focal planes of a budget that are drawn to find the covariance of its terms.
+# Focal planes of a budget that are drawn at least to find the covariance of its terms.
 _DRAWS = 8
+# CCDs that are drawn at least: a camera of few needs more focal planes, or its 28 terms would have fewer draws.
+_DRAWN_CCDS = 300
 # Nodes along the side of a CCD at which drawn heights are projected and fitted heights are tabulated.
 _NODES = 20
 # Variance of a coefficient without a budget term [m^2], to keep the prior invertible: 1 nm.
@@ -64,7 +66,7 @@ class HeightPrior:
         budget = load_budget(budget) if isinstance(budget, str) else budget
         unplaced = replace(camera, placement=None)
         # Seeds far from those that people choose, so that no run is fitted with its own heights.
-        seeds = range(2**31, 2**31 + _DRAWS)
+        seeds = range(2**31, 2**31 + max(_DRAWS, -(-_DRAWN_CCDS // len(camera))))
         ccd = np.zeros((len(powers(degree)), len(powers(degree))))
         for term in ("ccd", "tilt", "potato_chip"):
             drawn = [FocalPlane.from_budget(unplaced, seed=s, terms=(term,), budget=budget) for s in seeds]

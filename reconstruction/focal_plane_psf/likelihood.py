@@ -39,6 +39,10 @@ _WIDTHS = (1.0, 1.0, 1.0, 1.5)
 _VARIANCE_WIDTH = 3.0
 # Logarithm of the amplitude of a component over the variance of the values, below which it counts as absent.
 _VANISHED = -6.0
+# Least signal of the first guess, over the variance of the values.
+_LEAST_SIGNAL = 0.1
+# Rounds in which variances and the weights of their stars follow each other.
+_ROUNDS = 10
 #: Variance of the part common to all stars, over the mean square of the values.
 _CONSTANT = 100.0
 
@@ -121,11 +125,14 @@ def fit_covariance(
     max_iterations : int
         Most steps of the search (L-BFGS).
     """
-    extent = float(np.ptp(places.xy, axis=0).max())
+    # Of stars at one place the lengths are without effect.
+    extent = float(np.ptp(places.xy, axis=0).max()) or 1.0
     centred = values - np.average(values, weights=1.0 / noise)
-    power = max(float(np.mean(centred**2)), 1e-12 * float(np.mean(values**2)), 1e-30)
+    weights = _weights_of_squares(centred, noise)
+    mean_square = float(weights @ values**2)
+    power = max(float(weights @ centred**2), 1e-12 * mean_square, 1e-30)
     if constant is None:
-        constant = _CONSTANT * max(power, float(np.mean(values**2)))
+        constant = _CONSTANT * max(power, mean_square)
     prepared = []
     for index in blocks_of(places.xy) if blocks is None else blocks:
         block_places = places[index]
@@ -148,7 +155,7 @@ def fit_covariance(
     bounds = [_AMPLITUDES, _LENGTHS, _LENGTHS, _SHEAR] * COMPONENTS + [_AMPLITUDES] * (n_ccd + 1)
     # Inverse lengths are fitted.
     bounds = [(-b[1], -b[0]) if "length" in n else b for n, b in zip(names, bounds, strict=True)]
-    guess = _first_guess(centred, noise, power, n_ccd)
+    guess = _first_guess(float(weights @ noise) / power, n_ccd)
     first = guess.copy()
     if start is not None:
         packed_start = _pack_parameters(start, power, extent, n_ccd)
@@ -198,8 +205,19 @@ def log_likelihood(
     return total
 
 
-def _first_guess(values: np.ndarray, noise: np.ndarray, power: float, n_ccd: int) -> np.ndarray:
-    signal = max(1.0 - float(np.median(noise)) / power, 0.1)
+def _weights_of_squares(values: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return weights of unit sum with which squares of values of unequal noise tell their common variance best."""
+    variance = float(np.mean(values**2))
+    for _ in range(_ROUNDS):
+        # The variance of a square is in proportion to the square of its mean.
+        weights = (noise + variance) ** -2.0
+        weights /= weights.sum()
+        variance = max(float(weights @ (values**2 - noise)), _LEAST_SIGNAL * float(weights @ noise))
+    return np.asarray(weights)
+
+
+def _first_guess(noise_fraction: float, n_ccd: int) -> np.ndarray:
+    signal = max(1.0 - noise_fraction, _LEAST_SIGNAL)
     guess = []
     for j in range(COMPONENTS):
         inverse = -np.log(_START[j])

@@ -194,10 +194,11 @@ class FocalPlanePsf(ModelFields, Result):
             stamp_size = catalogue.stamps.shape[1]
         fitted = fit_field(mosaic, data, instrument, heights, prior.alignment_rms, turbulence, threads, reporter)
         field = fitted.field
+        used[np.flatnonzero(used)[~fitted.consistent]] = False
         with reporter.stage("stars against the others"):
             good = field.inliers(threads)
             if not good.all():
-                # Covariances are hardly changed by a few stars; all else is solved again without them.
+                # Those that only the optics contradict hardly change the covariances.
                 field = field.with_stars(good)
                 used[np.flatnonzero(used)[~good]] = False
             residuals, variance = field.leave_one_out_residuals(threads)

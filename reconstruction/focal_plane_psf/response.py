@@ -143,7 +143,7 @@ class Instrument:
             raise DomainError("stamps: expected no offsets and no recenter, images of a model are centred")
         return cls(
             telescope,
-            _one_spectrum(wavelengths if isinstance(wavelengths, Light) else Light(wavelengths)),
+            _one_spectrum(telescope, wavelengths if isinstance(wavelengths, Light) else Light(wavelengths)),
             Atmosphere.from_site(telescope.site or "cerro_pachon", seed=0) if atmosphere is None else atmosphere,
             stamps,
             positive_angle(weight_fwhm, "weight_fwhm"),
@@ -266,9 +266,12 @@ class Instrument:
         return values
 
 
-def _one_spectrum(light: Light) -> Light:
-    """Return light as arrays in SI; DomainError where stars have spectra of their own."""
+def _one_spectrum(telescope: Telescope, light: Light) -> Light:
+    """Return light as arrays in SI; DomainError where it is not one spectrum, or not of the telescope."""
     waves = np.atleast_1d(metres(light.wavelengths, "wavelengths"))
+    if waves.ndim != 1 or not len(waves):
+        raise DomainError(f"wavelengths of shape {list(waves.shape)}: expected [n_wave]")
+    telescope.check_wavelength(waves)
     weights = None if light.weights is None else pure_numbers(light.weights, "weights")
     if weights is not None and weights.shape != waves.shape:
         raise DomainError(f"weights of shape {weights.shape}: expected one spectrum of {len(waves)} wavelengths")

@@ -36,6 +36,7 @@ from ...models.camera.ccd_surfaces import CcdSurfaces
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ..gaussian_field import inverse_from_cholesky
+from .consistent_stars import LEAST_STARS, fit_statistics
 from .fit import ExposureFit, ShapeData
 from .height_equations import ExposureState, HeightEquations
 from .heights import STATIC_DEGREE, HeightPrior
@@ -50,6 +51,8 @@ if TYPE_CHECKING:
 
 #: Gauss-Newton steps about the heights of all exposures.
 STEPS = 3
+# Steps of the covariances with which galaxies among the stars are found.
+_ROUGH = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,8 +183,8 @@ def fit_static_heights(
     Raises
     ------
     DomainError
-        If there are no exposures, the telescope has no camera, or stars were measured under another weight than that of
-        an instrument.
+        If there are no exposures, one has no usable star, the telescope has no camera, or stars were measured under
+        another weight than that of an instrument.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
     if not len(exposures):
@@ -202,12 +205,19 @@ def fit_static_heights(
     heights = np.zeros(height_prior.n_parameter)
     precision = np.zeros((height_prior.n_parameter, height_prior.n_parameter))
     height_prior.add_to(precision)
-    covariance = None
+    ccd_covariance: np.ndarray | None = None
     states: list[ExposureState | None] = [None] * len(exposures)
     for step in range(max(1, steps)):
         saved_in = None if folder is None else Path(folder)
         job = _ExposureJob(
-            instrument, height_prior, prior.alignment_rms, heights, saved_in, threads, instrument is telescope
+            instrument,
+            height_prior,
+            prior.alignment_rms,
+            heights,
+            ccd_covariance,
+            saved_in,
+            threads,
+            instrument is telescope,
         )
         matrix, vector = precision.copy(), -precision @ heights
         with reporter.stage(f"heights, step {step + 1} of {steps}", total=len(exposures)) as stage:
@@ -220,12 +230,10 @@ def fit_static_heights(
         with one_blas_thread():
             root = scipy.linalg.cholesky(matrix * scale[:, None] * scale, lower=True, overwrite_a=True)
             heights = heights + scale * scipy.linalg.cho_solve((root, True), scale * vector)
-        covariance = root, scale
-    assert covariance is not None
-    root, scale = covariance
-    with one_blas_thread():
-        full = inverse_from_cholesky(root) * scale[:, None] * scale
-        return StaticHeights(height_prior.focal_plane(heights), height_prior.per_ccd(full), len(exposures))
+            full = inverse_from_cholesky(root) * scale[:, None] * scale
+            ccd_covariance = height_prior.per_ccd(full)
+    assert ccd_covariance is not None
+    return StaticHeights(height_prior.focal_plane(heights), ccd_covariance, len(exposures))
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,6 +244,7 @@ class _ExposureJob:
     prior: HeightPrior
     alignment_rms: float
     heights: np.ndarray
+    ccd_covariance: np.ndarray | None  #: of the heights by the last step, [n_ccd, n_term, n_term]
     folder: Path | None
     threads: int | None
     has_weight: bool  #: whether the weight of the moments is that of the instrument, else that of the stars
@@ -243,17 +252,26 @@ class _ExposureJob:
     def __call__(self, numbered: tuple[int, int, Any, ExposureState | None]) -> HeightEquations:
         step, number, exposure, state = numbered
         stars = stars_of(exposure)
-        stars = stars.chosen(stars.usable)
+        usable = stars.usable
+        if not usable.any():
+            raise DomainError(
+                f"exposures[{number}]: 0 of {len(stars)} stars have position, shape and noise: expected one or more"
+            )
+        stars = stars.chosen(usable)
         instrument = self._under_weight(stars.weight_fwhm, number).with_rotator(stars.rotator)
-        places = places_of(Mosaic.of_camera(self.prior.camera), stars)
+        mosaic = Mosaic.of_camera(self.prior.camera)
+        places = places_of(mosaic, stars)
         data = ShapeData(places, stars.values, stars.noise**2)
         key = self._key(data, state, instrument)
         path = None if self.folder is None else self.folder / f"exposure_{number:05d}_step_{step}.npz"
         saved_equations = None if path is None else HeightEquations.read(path, key)
         if saved_equations is not None:
             return saved_equations
+        if len(data) >= LEAST_STARS:
+            data = data.chosen(fit_statistics(mosaic, data, _ROUGH, self.threads)[1])
         fit = ExposureFit(data, instrument, self.prior, self.alignment_rms, self.threads, Reporter(quiet=True))
-        fit.heights = self.heights.copy()
+        # What heights may still be off by is no turbulence that the residuals lack.
+        fit.heights, fit.ccd_covariance = self.heights.copy(), self.ccd_covariance
         if state is not None:
             fit.exposure, fit.covariances = state
         fit.linearise()
@@ -292,6 +310,8 @@ class _ExposureJob:
         digest.update(repr((VERSION, self.alignment_rms, instrument.key)).encode())
         if state is not None:
             digest.update(state.exposure.tobytes())
+        if self.ccd_covariance is not None:
+            digest.update(self.ccd_covariance.tobytes())
         return digest.hexdigest()
 
 

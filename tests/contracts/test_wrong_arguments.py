@@ -140,12 +140,13 @@ def mutated(function, arguments):
             yield name, change, arguments | {name: wrong}, must
 
 
-#: Wrong kinds that are none: masks of True and False, labels of any kind, integers as objects, mappings by name; or
-#: another error of the example comes first.
+#: Wrong kinds that are none: masks of True and False, labels of any kind, integers as objects, None among numbers,
+#: mappings by name; or another error of the example comes first.
 FINE = {
     ("mask", "bool"),
     ("indices", "bool"),
     ("terms", "objects"),
+    ("wind_directions", "objects"),
     ("exposures", "array"),
     *((name, "mapping") for name in ("reflectivity", "expansion", "values")),
     ("pointing", "unit"),

@@ -96,6 +96,23 @@ def test_fits_of_shared_unknowns_decide_on_the_side_too(focused, pairs):
             pachon.fit_donuts(focused, model=of_sides(-1, -1), fit=fit, **of_one_side, **OPTIONS)
 
 
+def test_one_donut_tells_degrees_of_freedom(focused, pairs):
+    """Of a single donut there were none, without a word."""
+    freedoms = pachon.load_degrees_of_freedom("lsst").select(["M2_dx", "M2_dy"])
+    fit = pachon.fit_donuts(
+        focused,
+        pairs[:1],
+        FIELDS[:1],
+        WAVELENGTH,
+        model=replace(of_sides(1), diffraction=False),
+        fit=pachon.sensing.ExposureDonuts(freedoms=freedoms),
+        **OPTIONS,
+    )
+    estimate = fit.degrees_of_freedom
+    assert (estimate.errors < estimate.prior).all()
+    assert np.isfinite(fit.zernikes).all()
+
+
 class Refined(pachon.sensing.ExposureDonuts):
     """Fit that is always refined."""
 

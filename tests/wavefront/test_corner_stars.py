@@ -40,3 +40,10 @@ def test_the_telescope_of_a_star_has_its_detector_where_the_sensor_is(telescope)
 def test_numbers_of_stars_are_checked():
     with pytest.raises(DomainError, match="n = 0: expected a whole number of at least 1"):
         pachon.corner_stars(LSST, n=0)
+
+
+@pytest.mark.parametrize("name", ["decam", "auxtel"])
+def test_telescopes_whose_field_is_smaller_are_refused(name):
+    """Eight sensors of the LSST were placed at 1.5 degrees of DECam, whose field ends at 1.25."""
+    with pytest.raises(DomainError, match=r"^sensors of the LSST camera up to .* deg from the axis: expected"):
+        pachon.corner_stars(pachon.load_telescope(name))

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from astropy import units as u
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError, UnknownNameError
@@ -293,3 +294,14 @@ def test_a_random_start_without_derivatives_is_left_out():
     box, start, effect = (np.array([-np.inf]), np.array([np.inf])), np.zeros(1), np.ones(1)
     found = LeastSquares(restarts=5, spread=1.0).solve(problem, box, (), problem.residuals(start), effect)
     assert found.changes == pytest.approx([1.0])
+
+
+def test_goals_in_a_unit(paul_baker):
+    """Numbers of a goal in nanometres were taken for metres."""
+    rays = Beams.of(paul_baker, FIELDS, [5e-7], sampling="rings", n_pupil=3)
+    goal = 1e-7 * np.random.default_rng(3).normal(size=(len(FIELDS), 1, len(rays.request.pupil)))
+    goals = (goal, 1e9 * goal * u.nm)
+    in_metres, in_nanometres = (pachon.design.WavefrontError(g).rms(paul_baker, rays) for g in goals)
+    assert in_nanometres == pytest.approx(in_metres, rel=1e-12)
+    with pytest.raises(DomainError, match=r"goal = .*: expected a unit that converts to m"):
+        pachon.design.WavefrontError(goal * u.kg)

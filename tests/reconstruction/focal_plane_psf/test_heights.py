@@ -207,3 +207,9 @@ def test_degree_and_columns():
     assert prior.n_common == 5 + 21
     assert prior.columns_of(0) == slice(26, 41)
     assert prior.columns_of(188) == slice(prior.n_parameter - 15, prior.n_parameter)
+
+
+def test_the_prior_of_one_ccd_has_no_terms_without_draws(part):
+    """Of one CCD, such as AuxTel's, eight were drawn for its 28 terms: 20 combinations were held to a nanometre."""
+    prior = HeightPrior.from_budget(part("R22", count=1), degree=6)
+    assert np.linalg.eigvalsh(prior.ccd[0])[0] > 100.0 * 1e-18

@@ -187,3 +187,28 @@ def test_blocks_are_neighbours():
     # edges where the median of the stars is, 1 / (2 sqrt(64)) = 6 % off at most three times.
     for index in blocks_of(xy, 64):
         assert np.ptp(xy[index], axis=0).max() < 0.25 + 3 * 0.06
+
+
+def test_stars_of_little_weight_change_little():
+    """The scatter of faint stars was taken for that of turbulence in the first guess, and the fit stayed near it."""
+    here, rng = places(60, 4), np.random.default_rng(5)
+    lengths = axes_matrix(0.1, 0.05, 0.4)
+    true = Covariance(0.0, np.array([1.6e-5, 0.0]), np.stack([lengths] * COMPONENTS), np.zeros(3), 0.0)
+    noise = np.where(np.arange(60) < 40, 1e-6, 0.04)
+    values = drawn(true, here, noise, 6)
+    bright = np.arange(60) < 40
+    alone = fit_covariance(here[bright], values[bright], noise[bright]).covariance
+    together = fit_covariance(here, values, noise).covariance
+    assert together.variance == pytest.approx(alone.variance, rel=0.1)
+    # Stars that say nothing have no effect.
+    noise[~bright], values[~bright] = 1e12, 1e6 * rng.normal(size=20)
+    without = fit_covariance(here, values, noise, constant=4e-4).covariance
+    alone = fit_covariance(here[bright], values[bright], noise[bright], constant=4e-4).covariance
+    assert without.variance == pytest.approx(alone.variance, rel=0.03)
+
+
+def test_stars_at_one_place_are_finite():
+    here = Places(np.zeros((3, 2)), np.zeros(3, dtype=int), np.zeros((3, 2)))
+    fit = fit_covariance(here, np.array([0.01, 0.02, 0.015]), np.full(3, 1e-6), constant=1e-4)
+    assert np.isfinite(fit.log_likelihood)
+    assert np.isfinite(fit.covariance.variance)

@@ -84,3 +84,17 @@ def test_a_telescope_that_does_not_cover_the_camera_gives_one_clear_line(stars, 
     there = FocalPlaneStars(tuple(corner.ccd_names[c] for c in ccd), x, y, stars.values, stars.noise)
     with pytest.raises(DomainError, match=r"^[^\n]*field[^\n]*$"):
         FocalPlanePsf.fit(there, load_telescope(name), camera=corner)
+
+
+def test_galaxies_among_stars_change_nothing(stars, camera):
+    """Of two in 60 one was left out, and both were in the covariances: sizes were off by three times as much."""
+    values, galaxies = stars.values.copy(), [7, 31]
+    values[galaxies] += np.array([[0.1, -0.05, 0.3], [-0.05, 0.02, 0.2]])
+    model = FocalPlanePsf.fit(replace(stars, values=values), camera=camera, threads=1)
+    assert np.flatnonzero(~model.used).tolist() == galaxies
+    without = FocalPlanePsf.fit(stars.chosen(model.used), camera=camera, threads=1)
+    x, y = stars.x[galaxies], stars.y[galaxies]
+    ccd = [stars.ccd[i] for i in galaxies]
+    for a, b in zip(vars(model.shapes(ccd, x, y)).values(), vars(without.shapes(ccd, x, y)).values(), strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-4)
+    assert model.warnings == without.warnings

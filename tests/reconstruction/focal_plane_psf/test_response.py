@@ -239,3 +239,13 @@ def test_shapes_at_heights_in_silicon(plane):
     for height in np.array([-18.0, -7.0, 3.0, 16.0]) * UM:
         truth = instrument.shapes(fields, level_plane(plane, height), None)
         np.testing.assert_allclose(found.at(np.full(16, height)), truth, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("wavelengths", "message"),
+    [(622.0, "wavelength"), (np.zeros((2, 3)), "wavelengths of shape"), ([], "wavelengths of shape")],
+)
+def test_wavelengths_that_the_telescope_does_not_have(lsst_r, wavelengths, message):
+    """Nanometres as plain numbers, of which a fit failed much later."""
+    with pytest.raises(DomainError, match=message):
+        Instrument.of(lsst_r, wavelengths)

@@ -3,16 +3,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 from threadpoolctl import threadpool_limits
 
 from pachon.core.errors import DomainError, ProductError
+from pachon.core.progress import Reporter
 from pachon.core.units import ARCSEC
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.reconstruction.focal_plane_psf import static_heights
-from pachon.reconstruction.focal_plane_psf.fit import ExposureFit
-from pachon.reconstruction.focal_plane_psf.heights import powers
+from pachon.reconstruction.focal_plane_psf.fit import ExposureFit, ShapeData
+from pachon.reconstruction.focal_plane_psf.heights import HeightPrior, powers
+from pachon.reconstruction.focal_plane_psf.mosaic import Mosaic
 from pachon.reconstruction.focal_plane_psf.optics_prior import OpticsPrior
 from pachon.reconstruction.focal_plane_psf.response import Instrument
+from pachon.reconstruction.focal_plane_psf.stars import places_of
 from pachon.reconstruction.focal_plane_psf.static_heights import StaticHeights, fit_static_heights
 
 STEPS = 2
@@ -209,3 +213,51 @@ def test_bad_input_gives_one_clear_line(lsst_r, tmp_path):
         with pytest.raises(ProductError) as raised:
             StaticHeights.read(tmp_path / name)
         assert "\n" not in str(raised.value)
+
+
+def test_an_exposure_without_stars_is_named(exposures, lsst_r, wavelengths):
+    nothing = exposures[1].stars(values=np.full((20, 3), np.nan))
+    camera = exposures[0].camera
+    with pytest.raises(DomainError, match=r"^exposures\[0\]: 0 of 20 stars have position, shape and noise"):
+        fit_static_heights([nothing, exposures[0].stars()], Instrument.of(lsst_r, wavelengths), camera=camera)
+
+
+def test_turbulence_keeps_what_heights_may_still_be_off_by(exposures, lsst_r, wavelengths):
+    """Heights that had taken up a part of turbulence left too little of it: claimed variances of heights of 40 stars
+    on a CCD were a third of the squared errors.
+    """
+    stars, camera = exposures[0].stars(), exposures[0].camera
+    prior = HeightPrior.from_budget(camera, degree=6)
+    data = ShapeData(places_of(Mosaic.of_camera(camera), stars), stars.values, stars.noise**2)
+    fit = ExposureFit(data, Instrument.of(lsst_r, wavelengths), prior, 0.0, 1, Reporter(quiet=True))
+    fit.linearise()
+    variances = []
+    for covariance in (None, 0.25 * prior.ccd):
+        fit.covariances, fit.ccd_covariance = [], covariance
+        fit.fit_covariances(8)
+        variances.append([c.variance + c.nugget for c in fit.covariances])
+    assert (np.array(variances[1]) > np.array(variances[0])).all()
+    # The same as of a covariance of all parameters.
+    ccds = scipy.linalg.block_diag(np.zeros((prior.n_common,) * 2), *(0.25 * prior.ccd), np.zeros((25, 25)))
+    fit.covariances, fit.covariance = [], ccds
+    fit.fit_covariances(8)
+    np.testing.assert_allclose([c.variance + c.nugget for c in fit.covariances], variances[1], rtol=1e-6)
+
+
+def test_galaxies_say_nothing_of_heights(two_of, lsst_r, wavelengths, monkeypatch):
+    """One star in a hundred, 30 % larger than stars are, made heights of nine CCDs wrong by 1.4 um for 1.1 um."""
+    exposure = two_of(2, 20)[0]
+    stars, seen = exposure.stars(), []
+    values = stars.values.copy()
+    values[[3, 30]] += np.array([0.1, -0.05, 0.3])
+
+    def stop(self, data, *arguments):
+        seen.append(data.values)
+        raise InterruptedError
+
+    monkeypatch.setattr(ExposureFit, "__init__", stop)
+    with pytest.raises(InterruptedError):
+        fit_static_heights(
+            [replace(stars, values=values)], Instrument.of(lsst_r, wavelengths), camera=exposure.camera, threads=1
+        )
+    np.testing.assert_array_equal(seen[0], np.delete(values, [3, 30], axis=0))
