@@ -248,8 +248,11 @@ class FastRenderer(PsfRenderer):
         air = self._atmosphere
         if air is None:
             return ends[0] / self._diameter * self.focal_length
-        pupil = {"diameter": self._diameter, "obscuration": self._obscuration}
-        return self.focal_length * min(long_exposure_fwhm(wave, air.r0, air.outer_scale, **pupil) for wave in ends)
+        angles = (
+            long_exposure_fwhm(wave, air.r0, air.outer_scale, diameter=self._diameter, obscuration=self._obscuration)
+            for wave in ends
+        )
+        return self.focal_length * min(angles)
 
     def _filter_table(self) -> tuple[float, np.ndarray]:
         """Return the step of the baselines [m] and the filter at them, shape [n_wave, n]."""
