@@ -29,7 +29,7 @@ from ..models.telescope import Telescope
 from ..raytrace.ideal_lens import require_image
 from ..reconstruction.psf_model.basis import COMPONENTS
 from ..wavefront.psf.engines import ENGINES
-from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
+from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL, FastEngine
 from ..wavefront.psf.long_exposure import LongExposureEngine
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .alignment_states import with_active_optics_state
@@ -121,9 +121,8 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
         wavelengths = tuple(round(float(w) * 1e9, 3) for w in np.linspace(low, high, _WAVELENGTHS))
     psf = _with_defaults(
         config.psf,
-        (_WITH_ATMOSPHERE if atmosphere.enabled else _OPTICS_ALONE)
-        | _stamp_geometry(config, telescope, camera)
-        | _points_of_means(config.psf, telescope),
+        (_WITH_ATMOSPHERE | _pupil_points(config.psf, telescope) if atmosphere.enabled else _OPTICS_ALONE)
+        | _stamp_geometry(config, telescope, camera),
     )
     resolved = config.model_copy(
         update={
@@ -164,10 +163,10 @@ def _with_ground_wind(site: Site, wind: tuple[float, float] | None) -> Site:
     )
 
 
-def _points_of_means(psf: PsfConfig, telescope: Telescope) -> dict[str, float]:
-    """Return the points of the pupil of engines whose images are made of the mean over turbulence."""
+def _pupil_points(psf: PsfConfig, telescope: Telescope) -> dict[str, float]:
+    """Return the points of the pupil, with an atmosphere, of engines in which they depend on the telescope."""
     engine = ENGINES[psf.engine]
-    return {"n_pupil": engine.default_points(telescope)} if issubclass(engine, LongExposureEngine) else {}
+    return {"n_pupil": engine.default_points(telescope)} if issubclass(engine, FastEngine | LongExposureEngine) else {}
 
 
 def _reconstruction(fit: ReconstructionConfig, weight_fwhm_arcsec: float) -> ReconstructionConfig:

@@ -32,6 +32,7 @@ from ...core.errors import DomainError
 from ...core.launch import launch
 from ...core.units import require_count
 from ...core.warp_arrays import warp_array
+from ...models.telescope import Telescope
 from ..atmosphere.layer_screens import SLOPE_LAG
 from ..atmosphere.turbulence import (
     coherence,
@@ -52,6 +53,9 @@ from .sample_packets import LANES, indices, samples, to_packets
 
 #: Pupil points by default, with an atmosphere, which smears the pattern of the points.
 PUPIL_POINTS = 334
+#: Largest distance of these points [m], so that large pupils have more: 334 points in a pupil of 39 m would make as
+#: much scatter of e as turbulence of 15 s does. Pupils up to 8.6 m have 334 whatever their obscuration.
+LARGEST_SPACING = 0.42
 #: Pupil points by default, without an atmosphere.
 PUPIL_POINTS_STILL = 5000
 #: Side of the fine periodic grid over that of the stamp, with an atmosphere, whose wings wrap around. With 1.25 they
@@ -120,7 +124,7 @@ class FastEngine(PsfEngine):
     ----------
     n_pupil : int, optional
         Approximate number of pupil points, at least 10: the lattice is a whole number of screen pixels wide. By default
-        334, and 5000 without an atmosphere; more for stars far from focus.
+        334, points at most 0.42 m apart, and 5000 without an atmosphere; more for stars far from focus.
     oversampling : int, optional
         Cells of the fine grid per pixel, 1 to 32; by default 2, 12 without an atmosphere, and up to 32 where images
         are narrower than 3.3 of these cells.
@@ -142,6 +146,12 @@ class FastEngine(PsfEngine):
             require_count(self.n_pupil, "n_pupil", 10)
         if self.oversampling is not None:
             require_count(self.oversampling, "oversampling", 1, 32)
+
+    @classmethod
+    def default_points(cls, telescope: Telescope) -> int:
+        """Return the points by default, with an atmosphere."""
+        ring = 0.25 * math.pi * telescope.pupil_diameter**2 * (1.0 - telescope.pupil_obscuration**2)
+        return max(PUPIL_POINTS, math.ceil(ring / LARGEST_SPACING**2))
 
     def _renderer(self, inputs: PsfInputs) -> FastRenderer:
         return FastRenderer(inputs, self)
@@ -166,7 +176,7 @@ class FastRenderer(PsfRenderer):
         self._inner = traced_obscuration(self._obscuration) if far_from_focus else self._obscuration
         still, n_pupil = inputs.atmosphere is None, options.n_pupil
         if n_pupil is None:
-            n_pupil = PUPIL_POINTS_STILL if still else PUPIL_POINTS
+            n_pupil = PUPIL_POINTS_STILL if still else options.default_points(inputs.telescope)
         usual = OVERSAMPLING_STILL if still else OVERSAMPLING
         self._oversampling = options.oversampling or oversampling or usual
         self._place_pupil(n_pupil)
