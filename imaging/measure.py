@@ -39,6 +39,7 @@ from .image_stars import (
     few_or_many_stars,
     few_stars_warning,
     fit_image_psf,
+    undersampled_model_warning,
     undersampled_warning,
 )
 from .object_colours import ObjectColours
@@ -52,6 +53,8 @@ _REPLACED = dict.fromkeys(
     ("basis", "interpolation", "weights", "n_components", "order"),
     "a key of recipe, such as Recipe.of('paper', order=1)",
 )
+# PSFs of a model whose widths say whether pixels sample it.
+_WIDTHS = 9
 #: Largest distance of a detected object from a true one [pixel].
 _MATCH = 3.0
 
@@ -307,12 +310,17 @@ def measure_image(
         """Return PSFs of unit sum at pixels of the image, for the mean colour of the galaxies."""
         return psfs_on(image, model, positions, threads, mean_colour)
 
+    galaxy_psfs = psfs_on(image, model, places, threads, galaxy_colours)
+    if psf is not None:
+        step = max(1, len(galaxy_psfs) // _WIDTHS)
+        if (warning := undersampled_model_warning(galaxy_psfs[::step])) is not None:
+            warnings = (*warnings, warning)
     fits = fit_galaxies(
         image.image - objects.background,
         np.where(image.mask == 0, image.variance, 1.0),
         places[:, 0],
         places[:, 1],
-        psfs_on(image, model, places, threads, galaxy_colours),
+        galaxy_psfs,
         half_light_radius=np.nan_to_num(objects.half_light_radius[rows], nan=selected_stars.half_light_radius),
         mask=image.mask,
         segmentation=objects.segmentation,

@@ -94,8 +94,9 @@ def verdict(summary: dict[str, Any]) -> str:
 MOMENTS_NOTE = (
     "g = (a - b)/(a + b) and T = Mxx + Myy are of adaptive moments, as of DES, HSC and Rubin; weighted e = (a - "
     "b)/(a + b) is of moments under a round weight, as in Jee & Tyson (2011), about half of g. The e of the LSST's "
-    f"requirements is (a² - b²)/(a² + b²), about 2 g. Errors of ξ+ are a jackknife over {FEWEST_PATCHES} CCDs or more; "
-    "fewer are too few."
+    "requirements is (a² - b²)/(a² + b²), about 2 g. All are along the pixels, the distortion of the field in them; "
+    "runs with a pointing have G1_SKY and G2_SKY in their products. Errors of ξ+ are a jackknife over "
+    f"{FEWEST_PATCHES} CCDs or more; fewer are too few."
 )
 
 

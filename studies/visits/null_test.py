@@ -32,8 +32,9 @@ from .galaxy_shapes import GalaxyShapes, measure_galaxies
 from .null_result import AdditiveBias, NullTest, ShearBiases, null_metrics, shear_bias
 from .plots import density_picture, null_test_picture
 from .psf_errors import PsfAtGalaxies, PsfErrorResponse
-from .psf_visit import StackFrame, stack_limit
+from .psf_visit import StackFrame
 from .stack import PsfStack
+from .stack_exposure import faintest_galaxies, stack_exposure
 from .visits import cell_of, stack_path
 
 #: S/N of a star as faint as the faintest galaxies that are drawn: fainter ones have no useful ellipticity.
@@ -97,10 +98,12 @@ def null_test(
     make_folder(folder / "galaxies")
     tests = {}
     for visits in config.kept:
-        stamp = Stamp(config.galaxies_digest(experiment, stack=visits), seed)
+        of_list = {} if config.visits.from_list is None else {"noise": "of the list"}
+        stamp = Stamp(config.galaxies_digest(experiment, stack=visits, **of_list), seed)
         stack = PsfStack.read(stack_path(folder, visits), Stamp(config.digest(experiment), seed))
-        exposure = Exposure.of_run(experiment, visits, gain=1.0, pixel_scale=scale)
-        galaxies_in = source.down_to(faintest := stack_limit(experiment, FAINTEST_SNR, visits))
+        plan = config.plan_of(visits, seed)
+        exposure = stack_exposure(experiment, plan, scale)
+        galaxies_in = source.down_to(faintest := faintest_galaxies(experiment, plan, exposure, FAINTEST_SNR))
         covered_tiles = _covered_tiles(stack, cell, config.visits.places)[:tiles]
         if not covered_tiles:
             seen_by = counted(visits, "visit")

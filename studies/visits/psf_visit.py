@@ -38,8 +38,8 @@ from .resample import resample_stamps
 from .sky_points import SkyPoints
 from .visit_figures import VisitFigures
 
-# FWHM of the magnitude limits of the stars, which are the same in every visit, good or bad.
-_NOMINAL_FWHM = 0.7 * ARCSEC
+#: FWHM of the magnitude limits of the stars, which are the same in every visit, good or bad.
+NOMINAL_FWHM = 0.7 * ARCSEC
 # Least distance of stars from the edge of a CCD [pixel].
 _STAR_MARGIN = 20
 # Least distance of places without a star from the edge of a CCD [pixel].
@@ -281,14 +281,14 @@ def _positions_in_order(stars: StarField) -> np.ndarray:
 def magnitude_limits(experiment: Experiment) -> tuple[float, float]:
     """Return the magnitude limits of the stars, bright and faint, which are the same in every visit."""
     config = experiment.config
-    bright = saturation_magnitude(experiment.band, config.atmosphere.exposure_s, _NOMINAL_FWHM)
+    bright = saturation_magnitude(experiment.band, config.atmosphere.exposure_s, NOMINAL_FWHM)
     return bright, stack_limit(experiment, config.stars.snr_min, 1)
 
 
 def stack_limit(experiment: Experiment, snr: float, visits: int) -> float:
     """Return the magnitude of a star of a signal-to-noise ratio in a stack of visits of nominal seeing."""
     config = experiment.config
-    visit_limit = limiting_magnitude(snr, experiment.band, config.atmosphere.exposure_s, _NOMINAL_FWHM)
+    visit_limit = limiting_magnitude(snr, experiment.band, config.atmosphere.exposure_s, NOMINAL_FWHM)
     return float(visit_limit + 1.25 * np.log10(visits))
 
 

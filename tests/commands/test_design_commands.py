@@ -170,6 +170,9 @@ def test_zernikes_of_strongly_vignetted_fields_are_those_of_the_light(capsys, in
     # The LSST lights 70 % of it at the rim of its wavefront sensors, where stopped rays have a smooth wavefront.
     assert main(["zernikes", "lsst_v3.3_r", "--field-deg", "1.83", "--jmax", "11", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["pupil"] == "full"
+    # It was taken for the rms of the light, 162 nm at the edge.
+    assert main(["zernikes", "hsc", "--no-picture"]) == 0
+    assert "to 1313.21 nm rms over 5 fields, of the whole annulus; that of the light" in capsys.readouterr().out
     assert main(["zernikes", "hsc", "--pupil", "full"]) == 2
     assert "pupil = lit" in capsys.readouterr().err
 

@@ -119,10 +119,14 @@ def test_scattered_bad_pixels_leave_the_stars(field, catalogue, tmp_path):
 def test_stars_too_sharp_for_the_pixels_are_told(tmp_path, monkeypatch):
     """Errors of ellipticities were two to nine times those given at a FWHM of 1.8 to 1.5 pixels, without a word."""
     monkeypatch.setattr(drawn_fields, "PSF", (0.5, 0.0, 0.5))
-    catalogue = pachon.measure_image(loaded(draw_field(15, 5, side=200), tmp_path), threads=1)
+    image = loaded(draw_field(15, 5, side=200), tmp_path)
+    catalogue = pachon.measure_image(image, threads=1)
     (warning,) = catalogue.warnings
     assert re.match(r"its stars have a FWHM of 1\.[5-9]\d* pixels: below 2 ", warning)
     assert catalogue.metrics()["warnings"] == [warning]
+    # With a model of the PSF there was none: errors are right with it, but the shear of functionals is too small.
+    (warning,) = pachon.measure_image(image, psf=catalogue.psf, threads=1).warnings
+    assert re.match(r"its PSF model has a FWHM of 1\.[5-9]\d* pixels: .* shears are too small", warning)
 
 
 @pytest.mark.slow
