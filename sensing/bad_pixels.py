@@ -34,6 +34,8 @@ _FEW = 0.1
 _COMPACT = 3.0
 #: Distance by which rims of telescopes differ from their models [pixels].
 _RIM_SHIFT = 3
+#: The same of folds of bright light by terms of higher orders that a model lacks [pixels].
+_FOLD_SHIFT = 1
 #: Connected pixels from which on they may be a strip along a rim.
 _STRIP = 12
 #: Part of them that a rim at another place would explain.
@@ -139,20 +141,28 @@ def without_outliers(
     """Return the used pixels without those whose pull is beyond a limit, and those beside them.
 
     Strips of pixels along rims of the model are no outliers: their light is that of a rim at another place, for which
-    it is the only evidence. Nor are patches of pixels where a model still lacks neighbours, with ``lines_only``.
+    it is the only evidence. Nor are pixels with light that the model has next to them, of a fold of the wavefront, nor
+    patches of pixels where a model still lacks neighbours, with ``lines_only``.
     """
     far = used & (np.abs(pulls) > limit)
     if lines_only:
         far &= ~binary_opening(far, np.ones((_LINE + 1, _LINE + 1)))
     if not far.any():
         return used
-    side, noise = 2 * _RIM_SHIFT + 1, limit * np.abs(image - model) / np.maximum(np.abs(pulls), 1e-12)
-    at_rim = (image < maximum_filter(model, side) + noise) & (image > minimum_filter(model, side) - noise)
+    noise = limit * np.abs(image - model) / np.maximum(np.abs(pulls), 1e-12)
+    at_rim = _as_nearby(image, model, noise, _RIM_SHIFT)
     components, count = label(far, np.ones((3, 3)))
     sizes = np.bincount(components.ravel(), minlength=count + 1)
     along_rim = np.bincount(components.ravel(), weights=at_rim.ravel(), minlength=count + 1)
     strips = (sizes >= _STRIP) & (along_rim > _MOSTLY * sizes)
-    return used & ~grown(far & ~strips[components], used)
+    far &= ~strips[components] & ~_as_nearby(image, model, noise, _FOLD_SHIFT)
+    return used & ~grown(far, used)
+
+
+def _as_nearby(image: np.ndarray, model: np.ndarray, noise: np.ndarray, pixels: int) -> np.ndarray:
+    """Return which values of an image the model has, within the noise, up to a number of pixels from there."""
+    side = 2 * pixels + 1
+    return np.asarray((image < maximum_filter(model, side) + noise) & (image > minimum_filter(model, side) - noise))
 
 
 def unused_regions(used: np.ndarray) -> np.ndarray:

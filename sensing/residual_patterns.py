@@ -37,6 +37,8 @@ _HOPELESS = 20.0
 _LEAST_NOISE = 5e-3
 #: Loss of the logarithm of the likelihood by a level that is fitted.
 _WORTH = 2.0
+#: The same without air: a cheap level would take what the telescope has of large terms, and claims would be too small.
+_WORTH_AIRLESS = 8.0
 #: Levels that are tried.
 _LEVELS = 9
 #: Variance of a combination of patterns over the largest one below which it says nothing.
@@ -116,7 +118,7 @@ class Patterns:
         # The least rms is next to none.
         sizes = slice(1 if absent else None)
         for k, size in enumerate(figures):
-            losses[k], surplus[k] = self._losses(noise + size**2 * telescope)
+            losses[k], surplus[k] = self._losses(noise + size**2 * telescope, _WORTH_AIRLESS if absent else _WORTH)
             if losses[k, :, sizes].min() > losses[..., sizes].min() + _HOPELESS:
                 break
         of_rms, allowed = _prior((RMS_LOGARITHMS - _USUAL) / _WIDE, _NONE)[sizes], losses[..., sizes]
@@ -129,10 +131,10 @@ class Patterns:
             -2.0 * logsumexp(-losses, axis=1),
         )
 
-    def _losses(self, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _losses(self, base: np.ndarray, worth: float) -> tuple[np.ndarray, np.ndarray]:
         """Return losses without and with a level by the rms of the field, and the level, each [2, n_rms].
 
-        ``base`` is the covariance of the amplitudes without the field.
+        ``base`` is the covariance of the amplitudes without the field, ``worth`` the loss by a level.
         """
         strengths = np.exp(2.0 * RMS_LOGARITHMS)
         variances, vectors = eigh(np.diag(self.variances), base)
@@ -144,7 +146,7 @@ class Patterns:
         losses = 0.5 * ((np.log(total) + energies / total).sum(axis=2) + np.linalg.slogdet(base)[1])
         # What lies far out is part of the level.
         surplus = np.maximum((energies - of_field).mean(axis=1) - 1.0, 0.0)
-        return np.stack([losses[0], losses[1:].min(axis=0) + _WORTH]), np.stack([np.zeros(len(strengths)), surplus])
+        return np.stack([losses[0], losses[1:].min(axis=0) + worth]), np.stack([np.zeros(len(strengths)), surplus])
 
 
 def losses_of_field(losses: np.ndarray) -> np.ndarray:

@@ -249,6 +249,19 @@ def test_without_air_residuals_are_the_telescopes():
     assert sizes[1].figure == pytest.approx(1.0, rel=0.4)
 
 
+@pytest.mark.parametrize("ratio", [1.0, 2.0, 3.0])
+def test_without_air_large_terms_of_the_telescope_are_no_noise(ratio):
+    """Amplitudes drawn: a level of noise in all alike took a third of the variance of terms twice as large or more."""
+    rng, nothing = np.random.default_rng(3), np.zeros((40, 40))
+    expected, variances = 10.0 * np.arange(1.0, 41.0) ** -0.5, 5.0 * np.arange(1.0, 41.0) ** -3.0
+    drawn_ones = rng.normal(0.0, np.sqrt(1.0 + ratio**2 * expected), (20, 40))
+    sizes = [
+        Patterns(np.zeros((0, 40)), amplitudes, variances).sizes(nothing, np.diag(expected), nothing, absent=True)
+        for amplitudes in drawn_ones
+    ]
+    assert np.mean([size.figure for size in sizes]) == pytest.approx(ratio**2, rel=0.15)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("rms", "least", "most"), [(0.0, 25.0, 40.0), (3.0, 60.0, 250.0)])
 def test_well_figured_telescopes_claim_less(behind_focus, rms, least, most):
