@@ -204,7 +204,7 @@ def fit_pixel_fields(
     # Shape numbers of smooth fields may lie near a line, across which stars show nothing: no correction is larger than
     # the response itself.
     with np.errstate(over="ignore"):  # stars without any noise have no limit
-        most = float((response[:_SHAPE_NUMBERS] ** 2).max() / noise_floor[relative.argmax()])
+        most = float((response[:_SHAPE_NUMBERS] ** 2).max() / (relative * noise_floor).max())
     variances = variances_of(residuals, contrasts, most)
     if variances.any():
         if len(brightest) < len(noise):
