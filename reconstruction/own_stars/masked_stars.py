@@ -213,7 +213,7 @@ def predict_from_others(
         mean = values.mean(axis=0)
         relative = np.maximum(mean, _FAINTEST * mean.max()) / pixel_noise.ravel()
         relative /= relative.max()
-        variances = relative * contrasts.scale_of(values, relative, pixel_noise.ravel())
+        variances = relative * contrasts.scale_of(values, relative, pixel_noise.ravel())[0]
         columns = np.flatnonzero(missing.any(axis=0))
         for _ in range(_PREDICTIONS - 1):
             of_columns = values[:, columns]

@@ -9,9 +9,9 @@ stretching and magnifying it, corrected as far as the stars show it. What is lef
 Numbers and residuals are kriged apart: most pixels have no signal of their own, and what the shape needs to follow a
 field would bring the noise of a few stars into them.
 
-Corrections and residuals are Gaussian fields whose variance in a pixel is in proportion to its light, times one factor
-that has the largest evidence by all pixels (empirical Bayes); where the stars show none it is zero, and a pixel is the
-mean of all stars, each with the inverse variance of its noise.
+Corrections and residuals are Gaussian fields whose variance in a pixel is in proportion to its light or to the square
+of that, times one factor; both have the largest evidence by all pixels (empirical Bayes); where the stars show none it
+is zero, and a pixel is the mean of all stars, each with the inverse variance of its noise.
 """
 
 from __future__ import annotations
@@ -27,8 +27,10 @@ from .pixel_sums import log_powers_and_variances
 
 # Shape numbers to which pixels respond as to a stretch and a magnification; they come first.
 _SHAPE_NUMBERS = 3
-# Variance of a pixel is in proportion to its light, and at least that of this fraction of the brightest one's.
+# Variance of a pixel is that of a pixel with at least this fraction of the light of the brightest one.
 _FAINTEST = 1e-4
+# Powers of the light of a pixel that its variance may be in proportion to: that with the larger evidence is taken.
+_POWERS = (1.0, 2.0)
 # Least variance of the noise of a pixel over that of the noisiest: stars without sky noise have dark pixels without.
 _LEAST_NOISE = 1e-6
 # Factors of the variance of signal over that of noise, in the mean of all stars, of the pixel where it is largest:
@@ -127,21 +129,22 @@ class Contrasts:
         """Return values [n, k] less their prediction by the other stars, [n, k] (Dubrule 1983)."""
         return self.dual(values, scales) / self.precision(scales)
 
-    def scale_of(self, values: np.ndarray, relative: np.ndarray, unit: np.ndarray) -> float:
-        """Return the factor of the variances `relative` [k], 1 at most, of values [n, k] that has the largest evidence.
+    def scale_of(self, values: np.ndarray, relative: np.ndarray, unit: np.ndarray) -> tuple[float, float]:
+        """Return the factor of variances of values [n, k] that has the largest evidence, and that over that of none.
 
-        Both are in units of variances [k]. The variance of the noise of each column is unknown. Zero where no factor
-        has the evidence that counts.
+        The variances `relative` [k] are 1 at most; all are in units of variances [k]. The variance of the noise of
+        each column is unknown. Zeros where no factor has the evidence that counts.
         """
         mean_variance = float(self.variances.mean()) if len(self.variances) else 0.0
         if not mean_variance > 0.0:
-            return 0.0
+            return 0.0, 0.0
         squares = (self.axes.T @ values) ** 2 / unit
         factors = np.concatenate([[0.0], _FACTORS])
         log_powers, log_variances = log_powers_and_variances(squares, self.variances / mean_variance, relative, factors)
         evidence = -0.5 * (log_variances + len(squares) * log_powers)
         best = int(np.argmax(evidence))
-        return float(factors[best]) / mean_variance if evidence[best] > evidence[0] + _LEAST_EVIDENCE else 0.0
+        gain = float(evidence[best] - evidence[0])
+        return (float(factors[best]) / mean_variance, gain) if gain > _LEAST_EVIDENCE else (0.0, 0.0)
 
 
 def fit_pixel_fields(
@@ -173,8 +176,9 @@ def fit_pixel_fields(
     star = mean + (weights @ deviations / weights.sum()).reshape(mean.shape)
     noise_floor = np.maximum(pixel_noise, max(_LEAST_NOISE * pixel_noise.max(), np.finfo(float).tiny))
     light = without_noise(star, (noise_floor / weights.sum()).reshape(star.shape))
-    relative = np.maximum(light, _FAINTEST * light.max()).ravel() / noise_floor
-    relative /= relative.max()
+    bright = np.maximum(light / light.max(), _FAINTEST).ravel()
+    shares = [bright**power / noise_floor for power in _POWERS]
+    shares = [share / share.max() for share in shares]
     response = shape_response(light)
     shape, further = filters[:_SHAPE_NUMBERS], filters[_SHAPE_NUMBERS:]
     try:
@@ -193,9 +197,13 @@ def fit_pixel_fields(
         return Contrasts.of(covariance[np.ix_(brightest, brightest)], noise[brightest])
 
     def variances_of(residuals: np.ndarray, contrasts: Contrasts, largest: float) -> np.ndarray:
-        """Return the variances that residuals show; that of the brightest pixel is `largest` at most."""
-        bright = residuals if len(brightest) == len(residuals) else residuals[brightest]
-        return relative * min(contrasts.scale_of(bright, relative, noise_floor), largest)
+        """Return the variances that residuals show; in no pixel are they more than `largest` [pixel units squared]."""
+        chosen = residuals if len(brightest) == len(residuals) else residuals[brightest]
+        scales = [contrasts.scale_of(chosen, share, noise_floor) for share in shares]
+        best = int(np.argmax([evidence for _, evidence in scales]))
+        share, scale = shares[best], scales[best][0]
+        with np.errstate(over="ignore"):  # stars without any noise have no limit
+            return share * min(scale, largest / float((share * noise_floor).max()))
 
     residuals = fields.split(deviations)[1]
     shapes = shapes[:, :_SHAPE_NUMBERS]
@@ -203,8 +211,7 @@ def fit_pixel_fields(
     contrasts = contrasts_of(shape_covariance)
     # Shape numbers of smooth fields may lie near a line, across which stars show nothing: no correction is larger than
     # the response itself.
-    with np.errstate(over="ignore"):  # stars without any noise have no limit
-        most = float((response[:_SHAPE_NUMBERS] ** 2).max() / (relative * noise_floor).max())
+    most = float((response[:_SHAPE_NUMBERS] ** 2).max())
     variances = variances_of(residuals, contrasts, most)
     if variances.any():
         if len(brightest) < len(noise):

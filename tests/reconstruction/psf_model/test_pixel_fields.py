@@ -155,3 +155,37 @@ def test_pixels_that_do_not_vary_are_the_mean_of_all_stars():
         ratios.append(rms(model.at(elsewhere)[:, dark], truth[:, dark]) / noise)
     # A quadratic has 2.4 times the noise. Stars of 1e5 electrons have photon noise besides, for which they count less.
     assert np.mean(ratios) < 1.2
+
+
+def test_stars_in_electrons_without_noise_have_no_wild_response():
+    """PSFs were off by 0.96 of the peak, since dark pixels without sky noise set no limit to the response."""
+    positions, elsewhere = np.random.default_rng(1).uniform(-1.0, 1.0, (2, 40, 2))
+    y, x = np.mgrid[-18:19, -18:19]
+
+    def stars(places):
+        u, v = places.T[:, :, None, None]
+        width = 2.0 * (1.0 + 2e-3 * (u + 0.6 * v**2))
+        stretched = (1.0 + 2e-3 * v) * (x - 0.01 * u) ** 2 + (y + 0.01 * u * v) ** 2
+        light = (1.0 + stretched / width**2) ** -8.0
+        return light / light.sum(axis=(1, 2), keepdims=True)
+
+    truth = stars(elsewhere)
+    model = PsfModel.fit(1e4 * stars(positions), positions)
+    assert np.abs(model.at(elsewhere) - truth).max() < 0.01 * truth.max()
+
+
+def test_pixels_of_bright_stars_are_known_as_well_as_their_noise_allows():
+    """Wings, where photon noise hides what cores do, decided for all: 0.0041 of the peak, of 0.0093 over the CCD."""
+    rng = np.random.default_rng(1)
+    positions, elsewhere = rng.uniform(-1.0, 1.0, (2, 40, 2))
+    y, x = np.mgrid[-12:13, -12:13]
+
+    def stars(places):
+        u, v = places.T[:, :, None, None]
+        light = (1.0 + ((x - 0.04 * u) ** 2 + (y - 0.04 * v**2) ** 2) / 3.0**2) ** -3.0
+        return light / light.sum(axis=(1, 2), keepdims=True)
+
+    truth = stars(elsewhere)
+    model = PsfModel.fit(rng.poisson(1e6 * stars(positions)) + rng.normal(0.0, 5.0, (40, 25, 25)), positions)
+    error = np.sqrt(((model.at(elsewhere) - truth) ** 2).mean(axis=0)).max()
+    assert error < 0.003 * truth.max()
