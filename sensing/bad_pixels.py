@@ -137,12 +137,13 @@ def without_outliers(
     limit: float,
     *,
     lines_only: bool = False,
+    folds: bool = False,
 ) -> np.ndarray:
     """Return the used pixels without those whose pull is beyond a limit, and those beside them.
 
     Strips of pixels along rims of the model are no outliers: their light is that of a rim at another place, for which
-    it is the only evidence. Nor are pixels with light that the model has next to them, of a fold of the wavefront, nor
-    patches of pixels where a model still lacks neighbours, with ``lines_only``.
+    it is the only evidence. Nor are patches of pixels where a model still lacks neighbours, with ``lines_only``, nor
+    pixels with light that the model has next to them, with ``folds``: a fold of the wavefront, once rims are found.
     """
     far = used & (np.abs(pulls) > limit)
     if lines_only:
@@ -155,7 +156,9 @@ def without_outliers(
     sizes = np.bincount(components.ravel(), minlength=count + 1)
     along_rim = np.bincount(components.ravel(), weights=at_rim.ravel(), minlength=count + 1)
     strips = (sizes >= _STRIP) & (along_rim > _MOSTLY * sizes)
-    far &= ~strips[components] & ~_as_nearby(image, model, noise, _FOLD_SHIFT)
+    far &= ~strips[components]
+    if folds:
+        far &= ~_as_nearby(image, model, noise, _FOLD_SHIFT)
     return used & ~grown(far, used)
 
 

@@ -315,7 +315,8 @@ class StarFitter:
         model = model_image(full, best.stars[0], best.waves[0])
         for _ in range(_ROUNDS):
             pull = pulls(full, model)
-            used = without_outliers(pull, full.image, model, full.used, _CLIP * _typical(pull, model, full.used))
+            limit = _CLIP * _typical(pull, model, full.used)
+            used = without_outliers(pull, full.image, model, full.used, limit, folds=True)
             if (used == full.used).all():
                 break
             full = replace(full, used=used)

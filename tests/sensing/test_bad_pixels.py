@@ -77,7 +77,8 @@ def test_a_fold_of_light_beside_its_place_is_no_outlier(bright, outlier):
     model, image = ring(), ring()
     model[31, 30:33] += 600.0
     image[32, 30:33] += bright
-    used = without_outliers((image - model) / 5.0, image, model, np.ones(image.shape, dtype=bool), 7.0)
+    everything = np.ones(image.shape, dtype=bool)
+    used = without_outliers((image - model) / 5.0, image, model, everything, 7.0, folds=True)
     assert used[32, 30:33].all() != outlier
 
 
