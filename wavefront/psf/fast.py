@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.fft
@@ -30,6 +31,7 @@ from ...core.arguments import check_arguments
 from ...core.buffers import empty
 from ...core.errors import DomainError
 from ...core.launch import launch
+from ...core.statistics import FWHM_PER_RMS
 from ...core.units import require_count
 from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
@@ -74,10 +76,10 @@ OVERSAMPLING_STILL = 12
 #: Largest cell over the width of an image: pixels as wide as the seeing need more cells. Cells of half of the width
 #: would make the brightest pixel 5 % too bright, of 1.5 widths 44 %; of 0.33, 0.25 %.
 LARGEST_CELL = 0.3
-#: Most cells per pixel by default.
-MOST_CELLS = 32
 #: The same over the width without charge diffusion: rays that share one cell are taken for its middle.
 LARGEST_CELL_OF_RAYS = 0.5
+#: Most cells per pixel.
+MOST_CELLS = 32
 #: Distance on the CCD of the rays of neighbouring pupil points [pixels], with an atmosphere, beyond which a star counts
 #: as far from focus and is drawn with more points, and the largest that it then has.
 RAY_DISTANCE = (1.0, 0.25)
@@ -145,7 +147,7 @@ class FastEngine(PsfEngine):
         if self.n_pupil is not None:
             require_count(self.n_pupil, "n_pupil", 10)
         if self.oversampling is not None:
-            require_count(self.oversampling, "oversampling", 1, 32)
+            require_count(self.oversampling, "oversampling", 1, MOST_CELLS)
 
     @classmethod
     def default_points(cls, telescope: Telescope) -> int:
@@ -177,8 +179,8 @@ class FastRenderer(PsfRenderer):
         still, n_pupil = inputs.atmosphere is None, options.n_pupil
         if n_pupil is None:
             n_pupil = PUPIL_POINTS_STILL if still else options.default_points(inputs.telescope)
-        usual = OVERSAMPLING_STILL if still else OVERSAMPLING
-        self._oversampling = options.oversampling or oversampling or usual
+        self._usual_cells = OVERSAMPLING_STILL if still else OVERSAMPLING
+        self._oversampling = options.oversampling or oversampling or self._usual_cells
         self._place_pupil(n_pupil)
         self._make_grid()
         self._filter_step, self._filter = self._filter_table()
@@ -192,7 +194,9 @@ class FastRenderer(PsfRenderer):
         grid_bytes = 4 * len(self._channels.wave) * self._grid_size**2
         self._grid_batch = max(1, _GRID_BYTES // grid_bytes)
         # Besides its spectrum, on the finest of grids that stars may need, each star of a batch has rays.
-        finest = self._grid_size if options.oversampling else self._grid_side(int(self._cells_needed(np.zeros(1))[0]))
+        finest = self._grid_size
+        if options.oversampling is None and oversampling is None:
+            finest = self._grid_side(int(self._cells_needed(np.zeros(1))[0]))
         star_bytes = 4 * finest**2 + _RAY_BYTES * len(self._wavelengths) * len(self._points)
         self.batch = max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
 
@@ -243,17 +247,18 @@ class FastRenderer(PsfRenderer):
 
         The blurs are rms radii [m], [n_star].
         """
-        usual = OVERSAMPLING_STILL if self._atmosphere is None else OVERSAMPLING
-        rays = np.hypot(self._least_width(), math.sqrt(4.0 * math.log(2.0)) * blur)
-        gauss = math.sqrt(8.0 * math.log(2.0)) * math.hypot(self._plane.diffusion, self._plane.jitter)
+        usual = self._usual_cells
+        rays = np.hypot(self._least_width, FWHM_PER_RMS * math.sqrt(0.5) * blur)
+        gauss = FWHM_PER_RMS * math.hypot(self._plane.diffusion, self._plane.jitter)
         largest = LARGEST_CELL * np.hypot(rays, gauss)
         if self._atmosphere is not None:
             largest = np.minimum(largest, LARGEST_CELL_OF_RAYS * rays)
         power = np.ceil(np.log2(np.maximum(self._plane.pixel_size / (largest * usual), 1.0)))
         return np.minimum(usual * 2 ** power.astype(np.int64), MOST_CELLS)
 
+    @cached_property
     def _least_width(self) -> float:
-        """Return the width at half maximum of stars of ideal optics, by air and diffraction alone [m]."""
+        """Width at half maximum of stars of ideal optics, by air and diffraction alone [m]."""
         ends = (float(self._wavelengths.min()), float(self._wavelengths.max()))
         air = self._atmosphere
         if air is None:
