@@ -130,7 +130,10 @@ def saturation_magnitude(
     well = require_positive(band.full_well if full_well is None else full_well, "full_well", "electrons")
     room = well - background
     if room <= 0.0:
-        raise DomainError(f"full_well = {well:g}: expected more than the {background:.0f} electrons of the sky")
+        raise DomainError(
+            f"full_well = {well:g} (photometry.full_well_e of a configuration): expected more than the"
+            f" {background:.0f} electrons of the sky, or a shorter exposure"
+        )
     central = erf(0.5 * pixel / (np.sqrt(2.0) * sigma)) ** 2
     return float(magnitude_of(room / central, band, exposure))
 

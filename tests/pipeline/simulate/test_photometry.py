@@ -98,7 +98,7 @@ def test_bad_names_units_and_wells():
         photometry.electrons(20.0, "R", 15.0)
     with pytest.raises(DomainError, match="pixel_scale"):
         photometry.sky_electrons_per_pixel("r", 15.0, 0.2 * u.m)
-    with pytest.raises(DomainError, match="full_well"):
+    with pytest.raises(DomainError, match=r"full_well = 100 \(photometry.full_well_e of a configuration\): "):
         photometry.saturation_magnitude("r", 15.0, 0.7 * ARCSEC, full_well=100.0)
     with pytest.raises(DomainError, match="counts"):
         photometry.magnitude_of(0.0, "r", 15.0)
