@@ -18,13 +18,15 @@ from numpy.typing import ArrayLike
 from scipy import fft
 
 from ..core.arguments import check_arguments
-from ..core.errors import check_choice
+from ..core.errors import ConfigError, check_choice
 from ..core.threads import one_blas_thread, thread_count
 from .psf_field import PsfField
 
 DrawingWay = Literal["direct", "eigen"]
 #: Pixels along a side of the grid of a galaxy.
-SIZES = (32, 48, 64, 96, 128, 192, 256, 384, 512)
+SIZES = (32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048)
+#: Largest grid of which the transforms of all components of the PSF are held, for all galaxies [pixel].
+_COMMON = 512
 #: Largest light of a galaxy beyond its grid, where it wraps round, in rms of the noise of a pixel.
 _WRAPPED = 0.01
 #: Numbers of a block of galaxies: 8 MB in single precision, so that it stays in the cache of a processor.
@@ -143,7 +145,7 @@ def draw_galaxies(
         rms noise of a pixel [electron], a hundredth of which is the error allowed where a galaxy's light leaves its
         grid.
     way : {"direct", "eigen"}
-        How galaxies are convolved.
+        How galaxies are convolved; with a PSF on cells finer than pixels one by one.
     threads : int, optional
         Number of threads; all processors by default. No byte depends on it.
     progress : callable, optional
@@ -157,9 +159,11 @@ def draw_galaxies(
     Raises
     ------
     ConfigError
-        If there is no such way.
+        If there is no such way, or not with this PSF.
     """
     check_choice("way", way, get_args(DrawingWay))
+    if way == "eigen" and psf.cells > 1:
+        raise ConfigError("way = eigen: expected direct, for a PSF that pixels do not sample", key="image.way")
     area = Window(0, 0, wcs.shape[1], wcs.shape[0]) if window is None else window
     if way == "direct":
         return _draw_direct(galaxies, electrons, psf, wcs, area, noise, threads, progress)
@@ -227,29 +231,39 @@ def _draw_direct(
     profile = np.zeros(1) if psf is None else psf.profile()
     sizes = grid_sizes(electrons, radius, profile, noise)
     nearest = np.rint(pixels).astype(np.int64)
+    cells = 1 if psf is None else psf.cells
     amplitudes = np.ones((len(pixels), 1)) if psf is None else psf.amplitudes(pixels)
     amplitudes = (electrons[:, None] * amplitudes).astype(np.float32)
 
-    def blocks() -> Iterator[tuple[np.ndarray, int, np.ndarray]]:
+    def blocks() -> Iterator[tuple[np.ndarray, int, np.ndarray | None]]:
         for size in SIZES:
             # Those whose grid touches the window.
             galaxy_indices = np.flatnonzero((sizes == size) & window.contains(pixels, 0.5 * size))
             if len(galaxy_indices):
-                basis = _softening_transform(size)[None] if psf is None else psf.transforms(size)
-                flat = np.ascontiguousarray(basis).view(np.float32).reshape(len(basis), -1)
-                count = max(1, _BLOCK // size**2)
+                flat = None
+                if psf is None or cells * size <= _COMMON:
+                    basis = _softening_transform(size)[None] if psf is None else psf.transforms(cells * size)
+                    flat = np.ascontiguousarray(basis).view(np.float32).reshape(len(basis), -1)
+                count = max(1, _BLOCK // (cells * size) ** 2)
                 yield from ((galaxy_indices[i : i + count], size, flat) for i in range(0, len(galaxy_indices), count))
 
-    def drawn(block: tuple[np.ndarray, int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def drawn(block: tuple[np.ndarray, int, np.ndarray | None]) -> tuple[np.ndarray, np.ndarray]:
         galaxy_indices, size, basis = block
-        spectrum = galaxies.transform(
-            galaxy_indices, jacobians[galaxy_indices], pixels[galaxy_indices] - nearest[galaxy_indices], size, threads=1
-        )
-        with one_blas_thread():
-            kernel = amplitudes[galaxy_indices] @ basis
-        spectrum *= kernel.view(np.complex64).reshape(spectrum.shape)
-        corners = nearest[galaxy_indices] - size // 2 - (window.x, window.y)
-        return fft.irfft2(spectrum, s=(size, size), workers=1), corners
+        side = cells * size
+        # The centre of a pixel is half a pixel from the rim of its first cell.
+        offset = cells * (pixels[galaxy_indices] - nearest[galaxy_indices]) + 0.5 * (cells - 1)
+        spectrum = galaxies.transform(galaxy_indices, cells * jacobians[galaxy_indices], offset, side, threads=1)
+        if basis is None:
+            assert psf is not None
+            spectrum *= psf.transforms(side, amplitudes[galaxy_indices])
+        else:
+            with one_blas_thread():
+                kernel = amplitudes[galaxy_indices] @ basis
+            spectrum *= kernel.view(np.complex64).reshape(spectrum.shape)
+        stamps = fft.irfft2(spectrum, s=(side, side), workers=1)
+        if cells > 1:
+            stamps = stamps.reshape(-1, size, cells, size, cells).sum(axis=(2, 4))
+        return stamps, nearest[galaxy_indices] - size // 2 - (window.x, window.y)
 
     workers, waiting = thread_count(threads), blocks()
     with ThreadPoolExecutor(workers) as pool:

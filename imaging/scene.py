@@ -28,6 +28,8 @@ from .wcs import CcdWcs, ccd_wcs
 #: Pixels by which stamps of stars are larger than those of the PSF: in sums of hundreds of exposures the wings of a
 #: star just below saturation stay above the noise that far out.
 STAR_ROOM = 64
+#: Distance that light of galaxies of a population reaches at most [pixel]; those of a catalogue may be larger.
+REACH = 256
 #: Side of the cutouts [arcsec], as in Jee & Tyson 2011, fig. 10.
 CUTOUT = 100.0
 #: Long exposure beside that of the run [s], as there.
@@ -166,7 +168,7 @@ def draw_ccd(
     pixels = wcs.to_pixel(np.stack([galaxies.xi, galaxies.eta], axis=1))
     electrons = exposure.electrons(galaxies.magnitude) * psf.lit_fraction(pixels)
     noise = np.full(len(galaxies), exposure.noise_rms)
-    middle = middle_window(area, exposure).contains(pixels, 0.5 * SIZES[-1])
+    middle = middle_window(area, exposure).contains(pixels, REACH)
     noise[middle] /= np.sqrt(max(deep_exposures(exposure) / exposure.exposures, 1.0))
     in_area = area.contains(pixels)
     check_density(float(electrons[in_area].sum()) / (area.width * area.height), exposure)
@@ -264,7 +266,7 @@ def _add_stars(
     """Add the observed stars of the run; return pixel, magnitude and electrons of those in the window."""
     scale = exposure.pixel_scale
     # Places do not depend on the magnitude limits, which follow from the width of the PSF and the vignetting.
-    width = effective_fwhm(psf.model.mean[None], scale)
+    width = effective_fwhm(psf.mean[None], scale)
     provisional = ccd_stars(experiment, ccd, width)
     pixels = to_pixel(experiment, ccd, provisional.observed)
     if not len(pixels):
@@ -307,7 +309,8 @@ def check_density(electrons: float, exposure: Exposure, start: str = "") -> None
 
 def galaxies_near(galaxies: Sources | GalaxiesIn, wcs: SkyPixels, window: Window) -> Sources:
     """Return the galaxies on a window and so near that their light may reach it."""
-    xi, eta = sky_ranges(wcs, window.grown(SIZES[-1] // 2))
+    reach = getattr(galaxies, "reach", REACH) if callable(galaxies) else SIZES[-1] // 2
+    xi, eta = sky_ranges(wcs, window.grown(reach))
     if callable(galaxies):
         return galaxies(xi, eta)
     near = (xi[0] <= galaxies.xi) & (galaxies.xi <= xi[1]) & (eta[0] <= galaxies.eta) & (galaxies.eta <= eta[1])
