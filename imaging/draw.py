@@ -20,6 +20,7 @@ from scipy import fft
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, check_choice
 from ..core.threads import one_blas_thread, thread_count
+from ..sky.mosaic import PlantedGalaxies
 from .psf_field import PsfField
 
 DrawingWay = Literal["direct", "eigen"]
@@ -232,6 +233,8 @@ def _draw_direct(
     sizes = grid_sizes(electrons, radius, profile, noise)
     nearest = np.rint(pixels).astype(np.int64)
     cells = 1 if psf is None else psf.cells
+    if cells > 1 and isinstance(galaxies, PlantedGalaxies):
+        galaxies = galaxies.on_cells(cells)
     amplitudes = np.ones((len(pixels), 1)) if psf is None else psf.amplitudes(pixels)
     amplitudes = (electrons[:, None] * amplitudes).astype(np.float32)
 

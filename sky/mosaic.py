@@ -255,6 +255,10 @@ class PlantedGalaxies:
             distortion=self.distortion[indices],
         )
 
+    def on_cells(self, cells: int) -> PlantedGalaxies:
+        """Return the same galaxies with transforms for pixels so many times finer."""
+        return replace(self, stamps=replace(self.stamps, finest_pixel=self.stamps.finest_pixel / cells))
+
     def sheared(self, g1: Any, g2: Any, *, positions: bool = False) -> PlantedGalaxies:
         """Return the galaxies under a reduced shear that conserves areas, as :meth:`Galaxies.sheared`."""
         g = reduced_shear(g1, g2, len(self))

@@ -15,6 +15,7 @@ from pachon.pipeline.config import Configuration, PsfConfig
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.simulate.ccd_exposure import expose_positions
 from pachon.sky.galaxies import Galaxies
+from pachon.sky.mosaic import GalaxyStamps, PlantedGalaxies
 
 SIDE = 31
 #: Half-light radius of a Gaussian of unit rms width.
@@ -60,6 +61,28 @@ def test_galaxies_under_a_psf_that_pixels_do_not_sample(fwhm):
     assert field.stamp == SIDE
     assert field.mean == pytest.approx(on_cells(width, (0.0, 0.0), SIDE, 1), abs=1e-6)
     assert np.abs(image - expected).max() < 1e-4 * expected.max()
+
+
+def test_stamps_of_a_mosaic_under_a_psf_that_pixels_do_not_sample():
+    """Their tables are made for the pixels of the image, and were refused on finer cells."""
+    wide, place = 0.5, np.array([20.4, 19.7])
+    light = on_cells(wide, (0.0, 0.0), 5, 11)
+    stamps = GalaxyStamps(
+        magnitude=np.array([20.0]),
+        radius=np.array([wide * HALF_LIGHT]),
+        images=(light,),
+        center=np.zeros((1, 2)),
+        scale=np.eye(2) / 11,
+        psf_radius=0.01,
+        surface_density=1.0,
+        finest_pixel=1.0,
+    )
+    galaxy = PlantedGalaxies(stamps, np.array([0]), place[:1], place[1:], np.eye(2)[None])
+    field = field_of(on_cells(0.5, (0.0, 0.0), SIDE, 3), 41, 3)
+    image = draw_galaxies(galaxy, np.array([1e4]), field, SquarePixels(41))
+    # The light of the stamp's pixels stands in their centres, their squares have widened it.
+    expected = 1e4 * on_cells(np.sqrt(0.5**2 + wide**2 + 1.0 / (12 * 11**2)), place - 20.0, 41, 1)
+    assert np.abs(image - expected).max() < 2e-3 * expected.max()
 
 
 def test_a_run_of_coarse_pixels_draws_point_like_galaxies_as_its_stars(tmp_path, tiny):
