@@ -30,6 +30,8 @@ SIZES = (32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048)
 _COMMON = 512
 #: Largest light of a galaxy beyond its grid, where it wraps round, in rms of the noise of a pixel.
 _WRAPPED = 0.01
+#: Distance by which the PSF spreads the light of a galaxy [pixel]; its wings count by themselves.
+_BLUR = 3
 #: Numbers of a block of galaxies: 8 MB in single precision, so that it stays in the cache of a processor.
 _BLOCK = 2**21
 #: rms width of the Gaussian that the seeing-free image is convolved with, and the PSF deconvolved by [pixel]. Without
@@ -66,6 +68,9 @@ class Sources(Protocol):
 
     def take(self, indices: Any) -> Sources:
         """Return some of the galaxies."""
+
+    def light_beyond(self, distance: np.ndarray) -> np.ndarray:
+        """Return the largest light of galaxies of unit flux at a distance [rad] or beyond [1/rad^2]."""
 
     def transform(
         self, indices: Any, jacobian: np.ndarray, offset: np.ndarray, size: int, *, threads: int | None = None
@@ -174,18 +179,22 @@ def draw_galaxies(
     return _convolve_with_psf(scene, psf, wide, threads)[margin:-margin, margin:-margin].copy()
 
 
-def grid_sizes(electrons: np.ndarray, radius: np.ndarray, profile: np.ndarray, noise: float | np.ndarray) -> np.ndarray:
+def grid_sizes(
+    galaxies: Sources, electrons: np.ndarray, scale: np.ndarray, profile: np.ndarray, noise: float | np.ndarray
+) -> np.ndarray:
     """Return the size of the grid of each galaxy: the first of :data:`SIZES` that holds its light, [n].
 
-    Light beyond the grid wraps around, so none is lost. A size is accepted where a de Vaucouleurs galaxy and a star
-    of the same electrons are both fainter at its rim than a hundredth of the noise.
+    Light beyond the grid wraps around, so none is lost. A size is accepted where the galaxy and a star of the same
+    electrons are together fainter at its rim than a hundredth of the noise.
 
     Parameters
     ----------
+    galaxies : Galaxies
+        The galaxies.
     electrons : ndarray, shape [n]
-        Electrons of each galaxy.
-    radius : ndarray, shape [n]
-        Half-light radii [pixel].
+        Electrons of each.
+    scale : ndarray, shape [n]
+        Pixels in an angle [pixel/rad] where it is.
     profile : ndarray
         Largest value of the PSF beyond each number of pixels; zero after the last.
     noise : float or ndarray, shape [n]
@@ -196,9 +205,8 @@ def grid_sizes(electrons: np.ndarray, radius: np.ndarray, profile: np.ndarray, n
         # A pixel of margin for the place of the galaxy between pixels.
         edge = size // 2 - 1
         star = profile[edge] if edge < len(profile) else 0.0
-        # Ciotti & Bertin 1999: I = L / (22.665 r^2) exp(-7.669 ((R/r)^(1/4) - 1)).
-        galaxy = np.exp(-7.669 * ((edge / radius) ** 0.25 - 1.0)) / (22.665 * radius**2)
-        sizes[electrons * np.maximum(star, galaxy) < _WRAPPED * noise] = size
+        rim = galaxies.light_beyond((edge - _BLUR) / scale) / scale**2
+        sizes[electrons * (star + rim) < _WRAPPED * noise] = size
     return sizes
 
 
@@ -228,9 +236,9 @@ def _draw_direct(
         return image
     pixels = wcs.to_pixel(np.stack([galaxies.xi, galaxies.eta], axis=1))
     jacobians = wcs.jacobians(pixels)
-    radius = galaxies.radius * np.sqrt(np.abs(np.linalg.det(jacobians)))
+    scale = np.sqrt(np.abs(np.linalg.det(jacobians)))
     profile = np.zeros(1) if psf is None else psf.profile()
-    sizes = grid_sizes(electrons, radius, profile, noise)
+    sizes = grid_sizes(galaxies, electrons, scale, profile, noise)
     nearest = np.rint(pixels).astype(np.int64)
     cells = 1 if psf is None else psf.cells
     if cells > 1 and isinstance(galaxies, PlantedGalaxies):
