@@ -110,7 +110,7 @@ class Window:
         """Shape of an image of it."""
         return self.height, self.width
 
-    def contains(self, pixels: np.ndarray, margin: float = 0.0) -> np.ndarray:
+    def contains(self, pixels: np.ndarray, margin: float | np.ndarray = 0.0) -> np.ndarray:
         """Return whether pixels [n, 2] lie in it, or at most a margin [pixel] outside."""
         low = np.array([self.x, self.y]) - 0.5 - margin
         high = low + (self.width, self.height) + 2.0 * margin
