@@ -107,8 +107,8 @@ def main() -> None:
     some = galaxies.take(np.sort(np.random.default_rng(1).choice(inside, arguments.galaxies, replace=False)))
     pixels = wcs.to_pixel(np.stack([some.xi, some.eta], axis=1))
     electrons = exposure.electrons(some.magnitude)
-    pixel_radius = some.radius * np.sqrt(np.abs(np.linalg.det(wcs.jacobians(pixels))))
-    sizes = grid_sizes(electrons, pixel_radius, psf.profile(), exposure.noise_rms)
+    scale = np.sqrt(np.abs(np.linalg.det(wcs.jacobians(pixels))))
+    sizes = grid_sizes(some, electrons, scale, psf.profile(), exposure.noise_rms)
 
     def ours() -> np.ndarray:
         return draw_galaxies(some, electrons, psf, wcs, noise=exposure.noise_rms, threads=1)

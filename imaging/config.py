@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -20,6 +21,7 @@ from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, ProductError, error_context
 from ..core.files import content_hash
 from ..core.schema import Count, Positive, Real, Section, Switch, plain_number, validated
+from ..models.camera.photometry import PIXEL_SCALE
 from ..pipeline.config import (
     Configuration,
     InterpolationName,
@@ -35,7 +37,8 @@ from ..pipeline.experiment import Experiment
 from ..pipeline.listed_visit import visit_experiment
 from ..sky.visit_list.visit_list import ListedVisit
 
-#: Pixels along a side of the PSF's stamps where the run leaves them open: wings down to 1e-6 of the light.
+#: Pixels along a side of the PSF's stamps where the run leaves them open, as many arcseconds as of the LSST's on finer
+#: ones: wings down to 1e-6 of the light.
 PSF_STAMP = 63
 # Keys of galaxies that are paths of files.
 _FILES = ("catalogue", "mosaic")
@@ -123,21 +126,17 @@ class ImagesConfig(Section):
 
     def experiment(self, folder: Path | None = None) -> Experiment:
         """Return the experiment of the run; relative paths in its configuration start from `folder`."""
-        run = self._with_stamp()
+        run = self.run
         if run.pointing not in (None, self.pointing):
             raise ConfigError("run.pointing: expected none, or that of the images, under pointing")
         if run.stars.catalogue is not None or run.atmosphere.zenith_position_angle_deg is not None:
             run = run.model_copy(update={"pointing": self.pointing})
         with error_context(subject="run"):
-            return Experiment.from_config(run, folder)
-
-    def _with_stamp(self) -> Configuration:
-        """Return the configuration of the run, with larger stamps where it leaves them open."""
-        return self.run if self.run.psf.stamp is not None else with_options(self.run, psf__stamp=PSF_STAMP)
+            return with_stamps(Experiment.from_config(run, folder), run, PSF_STAMP)
 
     def of_visit(self, visit: ListedVisit, folder: Path | None = None) -> ImagesConfig:
         """Return the settings of a visit of a list: its run, pointing and sky."""
-        run = visit_experiment(self._with_stamp(), visit, folder).config
+        run = with_stamps(visit_experiment(self.run, visit, folder), self.run, PSF_STAMP).config
         image = self.image
         if math.isfinite(visit.sky):
             image = image.model_copy(update={"sky_mag": visit.sky})
@@ -159,6 +158,19 @@ class ImagesConfig(Section):
     def to_yaml(self) -> str:
         """Return the configuration as a YAML file."""
         return section_yaml(self, "All that decides these images.")
+
+
+def with_stamps(experiment: Experiment, run: Configuration, pixels: int) -> Experiment:
+    """Return an experiment whose stamps have so many pixels, or on finer ones the angle of those of the LSST.
+
+    The experiment itself where the configuration of the run has a stamp.
+    """
+    if run.psf.stamp is not None:
+        return experiment
+    pixel = experiment.band.pixel_scale
+    # An odd number, of which no rounding of an angle makes the next.
+    wide = 2 * math.ceil(0.5 * (pixels * PIXEL_SCALE / pixel - 1.0) - 1e-3) + 1
+    return replace(experiment, config=with_options(experiment.config, psf__stamp=max(pixels, wide)))
 
 
 @check_arguments

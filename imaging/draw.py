@@ -18,15 +18,20 @@ from numpy.typing import ArrayLike
 from scipy import fft
 
 from ..core.arguments import check_arguments
-from ..core.errors import check_choice
+from ..core.errors import ConfigError, check_choice
 from ..core.threads import one_blas_thread, thread_count
+from ..sky.mosaic import PlantedGalaxies
 from .psf_field import PsfField
 
 DrawingWay = Literal["direct", "eigen"]
 #: Pixels along a side of the grid of a galaxy.
-SIZES = (32, 48, 64, 96, 128, 192, 256, 384, 512)
+SIZES = (32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048)
+#: Largest grid of which the transforms of all components of the PSF are held, for all galaxies [pixel].
+_COMMON = 512
 #: Largest light of a galaxy beyond its grid, where it wraps round, in rms of the noise of a pixel.
 _WRAPPED = 0.01
+#: Distance by which the PSF spreads the light of a galaxy [pixel]; its wings count by themselves.
+_BLUR = 3
 #: Numbers of a block of galaxies: 8 MB in single precision, so that it stays in the cache of a processor.
 _BLOCK = 2**21
 #: rms width of the Gaussian that the seeing-free image is convolved with, and the PSF deconvolved by [pixel]. Without
@@ -63,6 +68,9 @@ class Sources(Protocol):
 
     def take(self, indices: Any) -> Sources:
         """Return some of the galaxies."""
+
+    def light_beyond(self, distance: np.ndarray) -> np.ndarray:
+        """Return the largest light of galaxies of unit flux at a distance [rad] or beyond [1/rad^2]."""
 
     def transform(
         self, indices: Any, jacobian: np.ndarray, offset: np.ndarray, size: int, *, threads: int | None = None
@@ -102,7 +110,7 @@ class Window:
         """Shape of an image of it."""
         return self.height, self.width
 
-    def contains(self, pixels: np.ndarray, margin: float = 0.0) -> np.ndarray:
+    def contains(self, pixels: np.ndarray, margin: float | np.ndarray = 0.0) -> np.ndarray:
         """Return whether pixels [n, 2] lie in it, or at most a margin [pixel] outside."""
         low = np.array([self.x, self.y]) - 0.5 - margin
         high = low + (self.width, self.height) + 2.0 * margin
@@ -143,7 +151,7 @@ def draw_galaxies(
         rms noise of a pixel [electron], a hundredth of which is the error allowed where a galaxy's light leaves its
         grid.
     way : {"direct", "eigen"}
-        How galaxies are convolved.
+        How galaxies are convolved; with a PSF on cells finer than pixels one by one.
     threads : int, optional
         Number of threads; all processors by default. No byte depends on it.
     progress : callable, optional
@@ -157,9 +165,11 @@ def draw_galaxies(
     Raises
     ------
     ConfigError
-        If there is no such way.
+        If there is no such way, or not with this PSF.
     """
     check_choice("way", way, get_args(DrawingWay))
+    if way == "eigen" and psf.cells > 1:
+        raise ConfigError("way = eigen: expected direct, for a PSF that pixels do not sample", key="image.way")
     area = Window(0, 0, wcs.shape[1], wcs.shape[0]) if window is None else window
     if way == "direct":
         return _draw_direct(galaxies, electrons, psf, wcs, area, noise, threads, progress)
@@ -169,18 +179,22 @@ def draw_galaxies(
     return _convolve_with_psf(scene, psf, wide, threads)[margin:-margin, margin:-margin].copy()
 
 
-def grid_sizes(electrons: np.ndarray, radius: np.ndarray, profile: np.ndarray, noise: float | np.ndarray) -> np.ndarray:
+def grid_sizes(
+    galaxies: Sources, electrons: np.ndarray, scale: np.ndarray, profile: np.ndarray, noise: float | np.ndarray
+) -> np.ndarray:
     """Return the size of the grid of each galaxy: the first of :data:`SIZES` that holds its light, [n].
 
-    Light beyond the grid wraps around, so none is lost. A size is accepted where a de Vaucouleurs galaxy and a star
-    of the same electrons are both fainter at its rim than a hundredth of the noise.
+    Light beyond the grid wraps around, so none is lost. A size is accepted where the galaxy and a star of the same
+    electrons are together fainter at its rim than a hundredth of the noise.
 
     Parameters
     ----------
+    galaxies : Galaxies
+        The galaxies.
     electrons : ndarray, shape [n]
-        Electrons of each galaxy.
-    radius : ndarray, shape [n]
-        Half-light radii [pixel].
+        Electrons of each.
+    scale : ndarray, shape [n]
+        Pixels in an angle [pixel/rad] where it is.
     profile : ndarray
         Largest value of the PSF beyond each number of pixels; zero after the last.
     noise : float or ndarray, shape [n]
@@ -191,9 +205,8 @@ def grid_sizes(electrons: np.ndarray, radius: np.ndarray, profile: np.ndarray, n
         # A pixel of margin for the place of the galaxy between pixels.
         edge = size // 2 - 1
         star = profile[edge] if edge < len(profile) else 0.0
-        # Ciotti & Bertin 1999: I = L / (22.665 r^2) exp(-7.669 ((R/r)^(1/4) - 1)).
-        galaxy = np.exp(-7.669 * ((edge / radius) ** 0.25 - 1.0)) / (22.665 * radius**2)
-        sizes[electrons * np.maximum(star, galaxy) < _WRAPPED * noise] = size
+        rim = galaxies.light_beyond((edge - _BLUR) / scale) / scale**2
+        sizes[electrons * (star + rim) < _WRAPPED * noise] = size
     return sizes
 
 
@@ -223,33 +236,45 @@ def _draw_direct(
         return image
     pixels = wcs.to_pixel(np.stack([galaxies.xi, galaxies.eta], axis=1))
     jacobians = wcs.jacobians(pixels)
-    radius = galaxies.radius * np.sqrt(np.abs(np.linalg.det(jacobians)))
+    scale = np.sqrt(np.abs(np.linalg.det(jacobians)))
     profile = np.zeros(1) if psf is None else psf.profile()
-    sizes = grid_sizes(electrons, radius, profile, noise)
+    sizes = grid_sizes(galaxies, electrons, scale, profile, noise)
     nearest = np.rint(pixels).astype(np.int64)
+    cells = 1 if psf is None else psf.cells
+    if cells > 1 and isinstance(galaxies, PlantedGalaxies):
+        galaxies = galaxies.on_cells(cells)
     amplitudes = np.ones((len(pixels), 1)) if psf is None else psf.amplitudes(pixels)
     amplitudes = (electrons[:, None] * amplitudes).astype(np.float32)
 
-    def blocks() -> Iterator[tuple[np.ndarray, int, np.ndarray]]:
+    def blocks() -> Iterator[tuple[np.ndarray, int, np.ndarray | None]]:
         for size in SIZES:
             # Those whose grid touches the window.
             galaxy_indices = np.flatnonzero((sizes == size) & window.contains(pixels, 0.5 * size))
             if len(galaxy_indices):
-                basis = _softening_transform(size)[None] if psf is None else psf.transforms(size)
-                flat = np.ascontiguousarray(basis).view(np.float32).reshape(len(basis), -1)
-                count = max(1, _BLOCK // size**2)
+                flat = None
+                if psf is None or cells * size <= _COMMON:
+                    basis = _softening_transform(size)[None] if psf is None else psf.transforms(cells * size)
+                    flat = np.ascontiguousarray(basis).view(np.float32).reshape(len(basis), -1)
+                count = max(1, _BLOCK // (cells * size) ** 2)
                 yield from ((galaxy_indices[i : i + count], size, flat) for i in range(0, len(galaxy_indices), count))
 
-    def drawn(block: tuple[np.ndarray, int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def drawn(block: tuple[np.ndarray, int, np.ndarray | None]) -> tuple[np.ndarray, np.ndarray]:
         galaxy_indices, size, basis = block
-        spectrum = galaxies.transform(
-            galaxy_indices, jacobians[galaxy_indices], pixels[galaxy_indices] - nearest[galaxy_indices], size, threads=1
-        )
-        with one_blas_thread():
-            kernel = amplitudes[galaxy_indices] @ basis
-        spectrum *= kernel.view(np.complex64).reshape(spectrum.shape)
-        corners = nearest[galaxy_indices] - size // 2 - (window.x, window.y)
-        return fft.irfft2(spectrum, s=(size, size), workers=1), corners
+        side = cells * size
+        # The centre of a pixel is half a pixel from the rim of its first cell.
+        offset = cells * (pixels[galaxy_indices] - nearest[galaxy_indices]) + 0.5 * (cells - 1)
+        spectrum = galaxies.transform(galaxy_indices, cells * jacobians[galaxy_indices], offset, side, threads=1)
+        if basis is None:
+            assert psf is not None
+            spectrum *= psf.transforms(side, amplitudes[galaxy_indices])
+        else:
+            with one_blas_thread():
+                kernel = amplitudes[galaxy_indices] @ basis
+            spectrum *= kernel.view(np.complex64).reshape(spectrum.shape)
+        stamps = fft.irfft2(spectrum, s=(side, side), workers=1)
+        if cells > 1:
+            stamps = stamps.reshape(-1, size, cells, size, cells).sum(axis=(2, 4))
+        return stamps, nearest[galaxy_indices] - size // 2 - (window.x, window.y)
 
     workers, waiting = thread_count(threads), blocks()
     with ThreadPoolExecutor(workers) as pool:

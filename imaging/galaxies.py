@@ -16,8 +16,9 @@ from ..sky.galaxies import Galaxies
 from ..sky.mosaic import GalaxyStamps, PlantedGalaxies, StampPopulation
 from ..sky.population import GalaxyPopulation, counts
 from .config import GalaxySourceConfig
+from .draw import SIZES
 from .exposure import Exposure
-from .scene import check_density
+from .scene import REACH, check_density
 
 #: Galaxies with xi and eta in two ranges [rad].
 SkyGalaxies = Callable[[Any, Any], Galaxies | PlantedGalaxies]
@@ -117,6 +118,11 @@ class _FixedGalaxies:
 
     galaxies: Galaxies | StampPopulation
     faintest: float
+
+    @property
+    def reach(self) -> int:
+        """Distance that their light reaches at most [pixel]."""
+        return SIZES[-1] // 2 if isinstance(self.galaxies, Galaxies) else REACH
 
     def __call__(self, xi: Any, eta: Any) -> Galaxies | PlantedGalaxies:
         """Return those in two ranges that are no fainter than the limit."""

@@ -26,8 +26,13 @@ from .psf_field import PsfField, to_pixel
 from .wcs import CcdWcs, ccd_wcs
 
 #: Pixels by which stamps of stars are larger than those of the PSF: in sums of hundreds of exposures the wings of a
-#: star just below saturation stay above the noise that far out.
-STAR_ROOM = 64
+#: star just below saturation stay above the noise that far out. Those of brighter stars do so further out.
+STAR_ROOMS = (64, 256, 1024)
+STAR_ROOM = STAR_ROOMS[0]
+#: Largest light of a star at the rim of its stamp, in rms of the noise of a pixel.
+_WING = 0.5
+#: Distance that light of galaxies of a population reaches at most [pixel]; those of a catalogue may be larger.
+REACH = 256
 #: Side of the cutouts [arcsec], as in Jee & Tyson 2011, fig. 10.
 CUTOUT = 100.0
 #: Long exposure beside that of the run [s], as there.
@@ -166,7 +171,7 @@ def draw_ccd(
     pixels = wcs.to_pixel(np.stack([galaxies.xi, galaxies.eta], axis=1))
     electrons = exposure.electrons(galaxies.magnitude) * psf.lit_fraction(pixels)
     noise = np.full(len(galaxies), exposure.noise_rms)
-    middle = middle_window(area, exposure).contains(pixels, 0.5 * SIZES[-1])
+    middle = middle_window(area, exposure).contains(pixels, REACH)
     noise[middle] /= np.sqrt(max(deep_exposures(exposure) / exposure.exposures, 1.0))
     in_area = area.contains(pixels)
     check_density(float(electrons[in_area].sum()) / (area.width * area.height), exposure)
@@ -264,7 +269,7 @@ def _add_stars(
     """Add the observed stars of the run; return pixel, magnitude and electrons of those in the window."""
     scale = exposure.pixel_scale
     # Places do not depend on the magnitude limits, which follow from the width of the PSF and the vignetting.
-    width = effective_fwhm(psf.model.mean[None], scale)
+    width = effective_fwhm(psf.mean[None], scale)
     provisional = ccd_stars(experiment, ccd, width)
     pixels = to_pixel(experiment, ccd, provisional.observed)
     if not len(pixels):
@@ -273,27 +278,43 @@ def _add_stars(
     if not lit > 0.0:
         raise DomainError("no light reaches some stars: expected a CCD within the field of the telescope")
     magnitude = ccd_stars(experiment, ccd, width, least_light=lit).magnitude
-    near = window.contains(pixels, 0.5 * (psf.stamp + STAR_ROOM))
-    pixels, magnitude = pixels[near], magnitude[near]
+    expected = exposure.electrons(magnitude) * psf.lit_fraction(pixels)
+    room = _star_rooms(psf, expected, exposure)
+    near = window.contains(pixels, 0.5 * (psf.stamp + room[:, None]))
+    pixels, magnitude, room = pixels[near], magnitude[near], room[near]
     if not len(pixels):
         return {"PIXEL": pixels, "MAG": magnitude, "FLUX": magnitude}
     nearest = np.rint(pixels).astype(np.int64)
-    kelvin = provisional.temperature
-    stars = expose_positions(
-        experiment,
-        provisional.observed[near],
-        threads,
-        progress,
-        room=STAR_ROOM,
-        offsets=pixels - nearest,
-        along=ccd,
-        temperatures=None if kelvin is None else kelvin[near],
-    )
-    electrons = exposure.electrons(magnitude) * stars.lit_fraction
-    corners = nearest - stars.image.shape[1] // 2 - (window.x, window.y)
-    add_stamps(image, stars.image * electrons[:, None, None].astype(np.float32), corners)
+    kelvin = None if provisional.temperature is None else provisional.temperature[near]
+    electrons = np.empty(len(pixels))
+    for size in np.unique(room):
+        rows = np.flatnonzero(room == size)
+        stars = expose_positions(
+            experiment,
+            provisional.observed[near][rows],
+            threads,
+            progress,
+            room=int(size),
+            offsets=(pixels - nearest)[rows],
+            along=ccd,
+            temperatures=None if kelvin is None else kelvin[rows],
+        )
+        electrons[rows] = exposure.electrons(magnitude[rows]) * stars.lit_fraction
+        corners = nearest[rows] - stars.image.shape[1] // 2 - (window.x, window.y)
+        add_stamps(image, stars.image * electrons[rows, None, None].astype(np.float32), corners)
     in_window = window.contains(pixels)
     return {"PIXEL": pixels[in_window], "MAG": magnitude[in_window], "FLUX": electrons[in_window]}
+
+
+def _star_rooms(psf: PsfField, electrons: np.ndarray, exposure: Exposure) -> np.ndarray:
+    """Return the pixels by which the stamp of each star of so many electrons is larger than those of the PSF, [n]."""
+    profile = psf.profile()
+    rooms = np.full(len(electrons), STAR_ROOMS[-1])
+    for room in reversed(STAR_ROOMS[:-1]):
+        # Wings by diffraction fall with the third power of the distance, those by turbulence a little faster.
+        rim = profile[-1] * (psf.stamp / (psf.stamp + room)) ** 3
+        rooms[electrons * rim < _WING * exposure.noise_rms] = room
+    return rooms
 
 
 def check_density(electrons: float, exposure: Exposure, start: str = "") -> None:
@@ -307,7 +328,8 @@ def check_density(electrons: float, exposure: Exposure, start: str = "") -> None
 
 def galaxies_near(galaxies: Sources | GalaxiesIn, wcs: SkyPixels, window: Window) -> Sources:
     """Return the galaxies on a window and so near that their light may reach it."""
-    xi, eta = sky_ranges(wcs, window.grown(SIZES[-1] // 2))
+    reach = getattr(galaxies, "reach", REACH) if callable(galaxies) else SIZES[-1] // 2
+    xi, eta = sky_ranges(wcs, window.grown(reach))
     if callable(galaxies):
         return galaxies(xi, eta)
     near = (xi[0] <= galaxies.xi) & (galaxies.xi <= xi[1]) & (eta[0] <= galaxies.eta) & (galaxies.eta <= eta[1])

@@ -86,11 +86,16 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     name = _absolute_path(name, folder, BUNDLED)
     with error_context(key=None if config.telescope is None else "telescope"):
         telescope = load_telescope(name)
-    band = band or _band_of(name, telescope)
+    named_band = _band_of(name, telescope)
     camera_name = None
     if config.camera is not None:
         camera_name = _absolute_path(config.camera, folder, CAMERAS, CAMERA_ENDINGS)
     camera = _camera_of(telescope, camera_name)
+    ends = telescope.band or telescope.wavelength_range
+    # The light of another filter than that of the model, or of one filter where the model has none.
+    if band is not None and (band != named_band or ends == telescope.wavelength_range):
+        ends = camera.photometry.edges(band)
+    band = band or named_band
     atmosphere = config.atmosphere
     site_name = _absolute_path(atmosphere.site or telescope.site or SITE, folder, ())
     plane = config.focal_plane
@@ -105,7 +110,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     with error_context(key=None if atmosphere.site is None else "atmosphere.site"):
         site = load_site(site_name)
     site = _with_ground_wind(site, atmosphere.ground_wind_m_s)
-    stars, light = config.stars, resolved_photometry(config.photometry, telescope, camera, band)
+    stars, light = config.stars, resolved_photometry(config.photometry, telescope, camera, band, ends)
     if stars.catalogue is not None:
         width, seconds, measured = PROVISIONAL_FWHM, atmosphere.exposure_s, band_of(band, light, airmass_of(atmosphere))
         stars = _with_defaults(
@@ -117,8 +122,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
         )
     wavelengths = config.wavelengths_nm
     if wavelengths is None:
-        low, high = telescope.band or telescope.wavelength_range
-        wavelengths = tuple(round(float(w) * 1e9, 3) for w in np.linspace(low, high, _WAVELENGTHS))
+        wavelengths = tuple(round(float(w) * 1e9, 3) for w in np.linspace(*ends, _WAVELENGTHS))
     psf = _with_defaults(
         config.psf,
         (_WITH_ATMOSPHERE | _pupil_points(config.psf, telescope) if atmosphere.enabled else _OPTICS_ALONE)

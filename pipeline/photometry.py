@@ -33,14 +33,14 @@ _AXIS_RAYS = 4096
 
 
 def resolved_photometry(
-    section: PhotometryConfig, telescope: Telescope, camera: Camera, band: BandName
+    section: PhotometryConfig, telescope: Telescope, camera: Camera, band: BandName, ends: tuple[float, float]
 ) -> PhotometryConfig:
-    """Return the section with the camera's numbers where there are none."""
+    """Return the section with the camera's numbers where there are none; `ends` are those of the light [m]."""
     open_keys = [key for key, value in section.model_dump().items() if value is None]
     values: dict[str, float | str] = {}
     if set(open_keys).intersection(_SAME):
-        low, high = telescope.band or (0.0, 0.0)
-        ends = (low, high) if high > low else BANDS[band].wavelength_range
+        if not ends[1] > ends[0]:
+            ends = camera.photometry.edges(band)
         area = 0.25 * math.pi * telescope.pupil_diameter**2 * (1.0 - telescope.pupil_obscuration**2)
         with error_context(key="band"):
             camera_band = camera.photometry.band(camera.name, band, area, ends)

@@ -15,7 +15,7 @@ from ..core.errors import DomainError, ProductError, error_context
 from ..core.files import write_bytes
 from ..core.products import Columns, table_hdu, write_ecsv, write_fits
 from ..core.table_files import parquet_bytes, read_columns
-from ..core.units import radians
+from ..core.units import ARCSEC, radians
 from ..models.camera.photometry import BandName
 from .galaxies import Galaxies
 from .imsim_galaxies import (
@@ -25,6 +25,7 @@ from .imsim_galaxies import (
     is_instance_catalogue,
 )
 from .pointing import tangent_plane
+from .sersic import GREATEST_INDEX, INDICES, LEAST_INDEX
 from .sky_shapes import along_tangent_plane
 
 #: Kinds of the files that are written, by their endings.
@@ -191,8 +192,7 @@ def _from_catalogue(
     radius = _column_values(columns, "half_light_radius", u.arcsec)
     if "q" in columns:
         ratio = _column_values(columns, "q")
-        if not np.all((ratio > 0.0) & (ratio <= 1.0)):
-            raise DomainError("column 'q': expected axis ratios above 0, at most 1", key="q")
+        _require_all((ratio > 0.0) & (ratio <= 1.0), ratio, "q", "an axis ratio above 0, at most 1")
         # From north towards east is from eta towards xi.
         e = (1.0 - ratio) / (1.0 + ratio) * np.exp(2j * (0.5 * np.pi - _column_values(columns, "pa", u.deg)))
         e1, e2 = e.real, e.imag
@@ -204,7 +204,18 @@ def _from_catalogue(
     if celestial is not None:
         e1, e2 = along_tangent_plane(e1, e2, *celestial, pointing)
     sersic = _column_values(columns, "n", default=1.0)
+    ellipticity = np.hypot(e1, e2)
+    _require_all(radius > 0.0, radius / ARCSEC, "half_light_radius", "a radius above 0 arcsec")
+    _require_all(ellipticity < 1.0, ellipticity, "e1, e2", "an ellipticity below 1")
+    _require_all((sersic >= LEAST_INDEX) & (sersic <= GREATEST_INDEX), sersic, "n", INDICES)
     return Galaxies.single(xi, eta, magnitude, radius, e1=e1, e2=e2, sersic=sersic)
+
+
+def _require_all(good: np.ndarray, values: np.ndarray, column: str, expectation: str) -> None:
+    """Raise DomainError for the first row of a column, as far as there is one, whose value is not good."""
+    if not good.all():
+        row = int(np.argmin(good))
+        raise DomainError(f"column {column!r}, row {row + 1}: {values[row]:g}, expected {expectation}", key=column)
 
 
 def _sign_of(convention: EllipticityConvention | None) -> float:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
+from scipy.special import gammaln
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, shown
@@ -18,7 +19,7 @@ from ..core.result import Result
 from ..core.units import ARCMIN, broadcast_together, for_each, pure_numbers, radians
 from ..core.warp_arrays import warp_array
 from .galaxy_kernels import transform_galaxies
-from .sersic import GREATEST_INDEX, LEAST_INDEX, sersic_table
+from .sersic import GREATEST_INDEX, INDICES, LEAST_INDEX, sersic_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -92,13 +93,16 @@ class Galaxies(Result):
                     raise DomainError(f"{name}: expected finite numbers")
         if self.first.shape != (n + 1,) or self.first[0] != 0 or self.first[-1] != m or np.any(np.diff(self.first) < 1):
             raise DomainError(f"first: expected {n + 1} rising indices from 0 to {m}, the number of components")
-        for name in ("radius", "component_radius"):
-            if np.any(getattr(self, name) <= 0.0):
-                raise DomainError(f"{name}: expected positive radii")
-        if np.any(self.e1**2 + self.e2**2 >= 1.0):
-            raise DomainError("e1, e2: expected ellipticities below 1")
-        if np.any((self.sersic < LEAST_INDEX) | (self.sersic > GREATEST_INDEX)):
-            raise DomainError(f"sersic: expected {LEAST_INDEX} to {GREATEST_INDEX}")
+        ellipticity, index = np.hypot(self.e1, self.e2), self.sersic
+        for name, values, good, expectation in (
+            ("radius", self.radius, self.radius > 0.0, "a positive radius in radians"),
+            ("component_radius", self.component_radius, self.component_radius > 0.0, "a positive radius in radians"),
+            ("e1, e2", ellipticity, ellipticity < 1.0, "an ellipticity below 1"),
+            ("sersic", index, (index >= LEAST_INDEX) & (index <= GREATEST_INDEX), INDICES),
+        ):
+            if not good.all():
+                at = int(np.argmin(good))
+                raise DomainError(f"{name} [{at}] = {values[at]:g}: expected {expectation}")
         if n and np.any(np.abs(np.add.reduceat(self.fraction, self.first[:-1]) - 1.0) > 1e-6):
             raise DomainError("fraction: expected the sum 1 in every galaxy")
 
@@ -204,6 +208,19 @@ class Galaxies(Result):
         d = (self.dx + 1j * self.dy) * inner
         z = (self.xi + 1j * self.eta) * (turn if positions else 1.0)
         return replace(self, xi=z.real, eta=z.imag, dx=d.real, dy=d.imag, e1=e.real, e2=e.imag)
+
+    def light_beyond(self, distance: np.ndarray) -> np.ndarray:
+        """Return the largest light of galaxies of unit flux at distances from their centres [rad] or beyond [1/rad^2].
+
+        Both [n]; that of the components on their major axes, with b of the profiles to 1e-3 (Ciotti & Bertin 1999).
+        """
+        n, e = self.sersic, np.hypot(self.e1, self.e2)
+        b = 2.0 * n - 1.0 / 3.0 + 4.0 / (405.0 * n)
+        major = self.component_radius * np.sqrt((1.0 + e) / (1.0 - e))
+        middle = np.exp(2.0 * n * np.log(b) - gammaln(2.0 * n)) / (2.0 * np.pi * n * self.component_radius**2)
+        from_component = np.maximum(np.asarray(distance)[self.owner] - np.hypot(self.dx, self.dy), 0.0)
+        light = self.fraction * middle * np.exp(-b * (from_component / major) ** (1.0 / n))
+        return np.add.reduceat(light, self.first[:-1]) if len(self) else np.zeros(0)
 
     def transform(
         self, indices: Any, jacobian: np.ndarray, offset: np.ndarray, size: int, *, threads: int | None = None

@@ -255,6 +255,15 @@ class PlantedGalaxies:
             distortion=self.distortion[indices],
         )
 
+    def light_beyond(self, distance: np.ndarray) -> np.ndarray:
+        """Return the largest light as :meth:`Galaxies.light_beyond`, of the law of de Vaucouleurs."""
+        # Ciotti & Bertin 1999: I = L / (22.665 r^2) exp(-7.669 ((R/r)^(1/4) - 1)).
+        return np.exp(-7.669 * ((distance / self.radius) ** 0.25 - 1.0)) / (22.665 * self.radius**2)
+
+    def on_cells(self, cells: int) -> PlantedGalaxies:
+        """Return the same galaxies with transforms for pixels so many times finer."""
+        return replace(self, stamps=replace(self.stamps, finest_pixel=self.stamps.finest_pixel / cells))
+
     def sheared(self, g1: Any, g2: Any, *, positions: bool = False) -> PlantedGalaxies:
         """Return the galaxies under a reduced shear that conserves areas, as :meth:`Galaxies.sheared`."""
         g = reduced_shear(g1, g2, len(self))

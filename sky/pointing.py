@@ -157,10 +157,15 @@ def tangent_plane(ra: Any, dec: Any, pointing: Any) -> tuple[np.ndarray, np.ndar
     Raises
     ------
     DomainError
-        If there is no pointing, or a position is 90 degrees or more from it.
+        If there is no pointing, a declination lies beyond a pole, or a position is 90 degrees or more from it.
     """
     if pointing is None:
         raise DomainError("ra, dec: expected pointing=(right ascension, declination)", key="pointing")
+    declination = np.rad2deg(np.atleast_1d(radians(dec, "dec")))
+    beyond = np.abs(declination) > 90.0 + 1e-9
+    if beyond.any():
+        at = int(np.argmax(beyond))
+        raise DomainError(f"dec [{at}] = {declination[at]:g} deg: expected -90 to 90", key="dec")
     sky = Pointing.of(pointing).from_celestial(ra, dec)
     if not np.isfinite(sky).all():
         raise DomainError("ra, dec: expected positions within 90 deg of the pointing")

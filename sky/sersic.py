@@ -14,6 +14,8 @@ from ..core.threads import one_blas_thread
 LEAST_INDEX = 0.3
 #: Greatest Sersic index, that of GalSim.
 GREATEST_INDEX = 6.2
+#: What is expected of an index.
+INDICES = f"{LEAST_INDEX} to {GREATEST_INDEX}"
 # Steps of the table. Interpolation with four points each way is off by 4e-6 of the flux at most, at an index of 0.3,
 # whose transform oscillates.
 _INDICES = 48

@@ -111,6 +111,10 @@ class CameraPhotometry:
     full_well: float = FULL_WELL
     gain: float = 1.0
 
+    def edges(self, name: str) -> tuple[float, float]:
+        """Return the ends of a band [m], those of the LSST's where it is not measured."""
+        return next((band for band in self.bands if band.name == name), BANDS[name]).wavelength_range
+
     def band(self, camera: str, name: str, area: float, wavelengths: tuple[float, float]) -> Band:
         """Return a band, estimated as of :func:`estimated_band` where none is measured.
 

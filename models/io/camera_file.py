@@ -27,7 +27,17 @@ from ...core.files import content_hash
 from ...core.schema import Count, Fraction, NotNegative, Positive, Real, Section, Switch, validated
 from ...core.yaml_reader import read_mapping
 from ..camera.camera import Camera
-from ..camera.photometry import DARK_CURRENT, FULL_WELL, LSST, READ_NOISE, THROUGHPUT, Band, BandName, CameraPhotometry
+from ..camera.photometry import (
+    BANDS,
+    DARK_CURRENT,
+    FULL_WELL,
+    LSST,
+    READ_NOISE,
+    THROUGHPUT,
+    Band,
+    BandName,
+    CameraPhotometry,
+)
 from .yaml.values import ROWS, OptionalText, Text
 
 #: Pixels along x and y of a CCD.
@@ -58,11 +68,10 @@ class BandSection(Section):
     effective_nm: Positive
 
     def band(self, name: BandName, source: str) -> Band:
-        """Return the band."""
-        wavelength = self.effective_nm / 1e9
-        return Band(
-            name, self.zero_point, self.dark_sky, self.extinction, wavelength, (wavelength, wavelength), source=source
-        )
+        """Return the band, its edges as far from its effective wavelength as those of the LSST's, in proportion."""
+        wavelength, lsst = self.effective_nm / 1e9, BANDS[name]
+        low, high = (end * wavelength / lsst.effective_wavelength for end in lsst.wavelength_range)
+        return Band(name, self.zero_point, self.dark_sky, self.extinction, wavelength, (low, high), source=source)
 
 
 class PhotometrySection(Section):

@@ -104,9 +104,12 @@ def test_both_ways_have_the_same_moments(wcs, psf):
 def test_what_wraps_round_is_below_a_hundredth_of_the_noise(wcs, psf):
     # The grid chosen for a galaxy against the largest one.
     pixels = np.array([[1200.0, 2150.0]])
-    for sersic, radius, light in ((4.0, 0.5, 3e4), (1.0, 1.5, 1e5), (1.0, 0.2, 100.0)):
-        galaxy = placed(wcs, pixels, sersic=sersic, radius=np.array([radius * ARCSEC]))
-        size = grid_sizes(np.array([light]), np.array([radius / 0.2]), psf.profile(), 24.0)[0]
+    # Elongated ones, of axis ratios of a quarter and a sixth, had grids of round ones: 1.2 and 2.3 electrons wrapped.
+    for sersic, radius, light, e in (
+        (4.0, 0.5, 3e4, 0.0), (1.0, 1.5, 1e5, 0.0), (1.0, 0.2, 100.0, 0.0), (4.0, 0.2, 5.8e4, 0.6), (1.0, 4.0, 6e4, 0.7)
+    ):  # fmt: skip
+        galaxy = placed(wcs, pixels, sersic=sersic, radius=np.array([radius * ARCSEC]), e1=e)
+        size = grid_sizes(galaxy, np.array([light]), np.array([5.0 / ARCSEC]), psf.profile(), 24.0)[0]
         assert size < SIZES[-1]
         window = Window(1200 - 150, 2150 - 150, 300, 300)
         chosen, largest = (
@@ -118,11 +121,12 @@ def test_what_wraps_round_is_below_a_hundredth_of_the_noise(wcs, psf):
 
 def test_brighter_and_larger_galaxies_have_larger_grids():
     profile = np.array([0.1, 1e-3, 1e-4, 1e-5])
-    light, radius = np.array([10.0, 1e4, 1e6, 1e9]), np.array([1.0, 1.0, 3.0, 20.0])
-    sizes = grid_sizes(light, radius, profile, 24.0)
+    light, one = np.array([10.0, 1e4, 1e6, 1e10]), np.ones(4)
+    galaxies = Galaxies.single(0.0, 0.0, 20.0, np.array([1.0, 1.0, 3.0, 20.0]), sersic=4.0)
+    sizes = grid_sizes(galaxies, light, one, profile, 24.0)
     assert (np.diff(sizes) >= 0).all()
     assert (sizes[0], sizes[-1]) == (SIZES[0], SIZES[-1])
-    assert (grid_sizes(light, radius, profile, 0.24) >= sizes).all()
+    assert (grid_sizes(galaxies, light, one, profile, 0.24) >= sizes).all()
 
 
 def test_stamps_are_cut_at_the_rim():

@@ -234,6 +234,22 @@ def test_a_deeper_exposure_of_a_scene_has_more_of_everything(small_run, stars):
     assert [scene.header["DATE-AVG"][-12:] for scene in (plain, deep)] == ["12:00:01.000", "12:01:40.000"]
 
 
+def test_wings_of_bright_stars_do_not_end_at_a_square(tiny, tmp_path):
+    """On stamps of 127 pixels those of magnitude 8 ended at 120 electrons a pixel, five times the noise."""
+    Table({"field_x": [0.0], "field_y": [0.0], "mag": [8.0]}).write(tmp_path / "bright.ecsv")
+    stars = {"stars__catalogue": str(tmp_path / "bright.ecsv"), "stars__brightest": 5.0, "stars__faintest": 25.0}
+    psf = {"psf__engine": "long_exposure", "psf__n_pupil": 300, "psf__stamp": 63}
+    experiment = Experiment.from_config(
+        tiny(ccds=("R22_S11",), stars__truth=24, wavelengths_nm=[620.0], **psf, **stars)
+    )
+    scene = draw_ccd(experiment, "R22_S11", nothing, window=Window(1700, 1700, 700, 700))
+    x, y = np.rint([scene.objects["X"][0], scene.objects["Y"][0]]).astype(int) - 1700
+    profile = np.array([scene.electrons[y, x + r - 2 : x + r + 3].mean() for r in (40, 60, 70, 100, 140)])
+    # As the power of the distance by which it falls, between those of diffraction and turbulence.
+    slopes = np.diff(np.log(profile)) / np.diff(np.log([40, 60, 70, 100, 140]))
+    assert ((slopes > -4.5) & (slopes < -2.5)).all()
+
+
 def test_light_beyond_the_grids_is_below_the_noise_of_the_deep_cutout(small_run):
     """A spheroid of 22 mag: its grid is chosen for one exposure, but in the middle for all of those of the cutout."""
 

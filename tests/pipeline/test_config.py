@@ -122,6 +122,29 @@ def test_screens_that_are_too_coarse_name_key_and_remedy():
         Experiment.from_config(with_options(Configuration(), atmosphere__screen_size=64))
 
 
+@pytest.mark.parametrize(
+    ("telescope", "band", "ends"),
+    [
+        # The telescope's own band, to the edges of its prescription.
+        ("decam", "r", (570, 715)),
+        # DECam's filters by their curves: 400 to 548 nm, 848 to 1002 nm; HSC's y: 934 to 1070 nm.
+        ("decam", "g", (401, 549)),
+        ("decam", "z", (866, 976)),
+        ("hsc", "y", (928, 1019)),
+        # Filters of the LSST where a camera has none of its own.
+        ("auxtel", "g", (403, 551)),
+    ],
+)
+def test_light_and_zero_point_are_those_of_the_band(telescope, band, ends):
+    config = Experiment.from_config(Configuration(telescope=telescope, band=band)).config
+    assert [config.wavelengths_nm[0], config.wavelengths_nm[-1]] == pytest.approx(ends, abs=1.0)
+    if telescope == "auxtel":
+        # One square metre, a throughput of a half, and flat light between the ends.
+        assert config.photometry.zero_point == pytest.approx(
+            2.5 * np.log10(5.48e10 * 0.5 * 1.00 * np.log(ends[1] / ends[0])), abs=0.02
+        )
+
+
 def test_the_default_goes_from_the_centre_to_the_edge_of_the_field():
     experiment = Experiment.from_config(Configuration())
     config = experiment.config

@@ -157,9 +157,18 @@ def without(name):
         (Table({"mag": [1.0]}), ProductError, "no columns 'ra' and 'dec', nor 'xi' and 'eta'; columns are mag"),
         (base(e1=[0.1, 0.1, 0.1]), ProductError, "no column 'e2'"),
         (base(q=[0.5, 0.5, 0.5]), ProductError, "no column 'pa'"),
-        (base(q=[0.5, 0.0, 0.5], pa=[0.0, 0.0, 0.0]), DomainError, "column 'q': expected axis ratios above 0"),
-        (base(n=[1.0, 9.0, 1.0]), DomainError, "sersic: expected 0.3 to 6.2"),
-        (base(e1=[0.9, 0.0, 0.0], e2=[0.9, 0.0, 0.0]), DomainError, "ellipticities below 1"),
+        (base(q=[0.5, 0.0, 0.5], pa=[0.0, 0.0, 0.0]), DomainError, "column 'q', row 2: 0, expected an axis ratio"),
+        (base(n=[1.0, 9.0, 1.0]), DomainError, "column 'n', row 2: 9, expected 0.3 to 6.2"),
+        (
+            base(e1=[0.9, 0.0, 0.0], e2=[0.9, 0.0, 0.0]),
+            DomainError,
+            "column 'e1, e2', row 1: 1.27279, expected an ellip",
+        ),
+        (
+            base(half_light_radius=[0.4, 0.3, 0.0]),
+            DomainError,
+            "column 'half_light_radius', row 3: 0, expected a radius",
+        ),
         (base(n=["a", "b", "c"]), DomainError, "column 'n': expected one number in every row"),
         (base(n=[1.0, 2.0, np.nan]), DomainError, "column 'n', row 3: expected a finite number"),
         (base(n=MaskedColumn([1.0, 2.0, 3.0], mask=[0, 1, 0])), DomainError, "column 'n', row 2"),
@@ -213,3 +222,10 @@ def test_components_out_of_order(tmp_path):
     table.write(path, overwrite=True)
     with pytest.raises(DomainError, match="column 'galaxy': expected 0, 1, 2"):
         read_galaxies(path)
+
+
+def test_declinations_beyond_a_pole_are_refused(tmp_path):
+    """-95 degrees was taken for -85 on the other side."""
+    table = Table({"ra": [10.0, 10.0], "dec": [-85.0, -95.0], "mag": [20.0, 20.0], "half_light_radius": [1.0, 1.0]})
+    with pytest.raises(DomainError, match=r"dec \[1\] = -95 deg: expected -90 to 90"):
+        read_galaxies(save(table, tmp_path / "wrong.ecsv"), pointing=np.deg2rad([10.0, -85.0]))

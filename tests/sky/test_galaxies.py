@@ -162,9 +162,9 @@ def test_take_and_concatenate():
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"radius": -1.0}, "radius"),
-        ({"e1": 0.8, "e2": 0.7}, "e1, e2"),
-        ({"sersic": 0.2}, "sersic: expected 0.3 to 6.2"),
+        ({"radius": -1.0}, r"^radius \[0\] = -1: expected a positive radius"),
+        ({"e1": 0.8, "e2": 0.7}, r"^e1, e2 \[0\] = 1\.06301: expected an ellipticity below 1"),
+        ({"sersic": 0.2}, r"^sersic \[0\] = 0\.2: expected 0\.3 to 6\.2"),
         ({"sersic": np.nan}, "sersic: expected finite"),
     ],
 )

@@ -12,8 +12,7 @@ from ....imaging.galaxies import SkyGalaxies
 from ....imaging.psf_field import PsfField, to_pixel
 from ....imaging.scene import STAR_ROOM, galaxies_near
 from ....pipeline.experiment import Experiment
-from ....pipeline.resolved_values import noise_free_components
-from ....pipeline.simulate.ccd_exposure import expose_centered, expose_positions
+from ....pipeline.simulate.ccd_exposure import NoiseFreeStars, expose_centered, expose_positions
 from ....pipeline.simulate.star_field import magnitudes_at
 from ..plan import Visit
 from ..psf_visit import magnitude_limits, middle_wavelength
@@ -95,15 +94,12 @@ def visit_image(
     at = to_pixel(experiment, name, xy)
     inside = (np.abs(at - 0.5 * (pixels - 1)) <= 0.5 * pixels - _LEAST_DEPTH).all(axis=1)
     rows = np.flatnonzero(inside & (np.hypot(xy[:, 0], xy[:, 1]) <= experiment.field_radius_on_detector))
-    psfs = expose_centered(experiment, xy[rows], threads, along=name)
-    field = PsfField.fit(
-        psfs.image.astype(np.float64),
-        at[rows],
-        pixels,
-        lit_fraction=psfs.lit_fraction,
-        n_components=noise_free_components(config),
-        order=config.reconstruction.truth_order,
-    )
+
+    def expose_stars(experiment: Experiment) -> NoiseFreeStars:
+        return expose_centered(experiment, xy[rows], threads, along=name)
+
+    psfs = expose_stars(experiment)
+    field = PsfField.of_stars(experiment, name, xy[rows], psfs, expose_stars)
     galaxies = galaxies_near(sky.galaxies, wcs, window)
     places = wcs.to_pixel(np.stack([galaxies.xi, galaxies.eta], axis=1))
     electrons = exposure.electrons(galaxies.magnitude) * field.lit_fraction(places)
