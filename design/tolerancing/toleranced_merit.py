@@ -27,6 +27,10 @@ _DRAWS = 4
 _SEED = 0
 #: Halvings of the moves of compensators that leave a drawn telescope without light.
 _HALVINGS = 20
+#: Steps by which the compensators of a traced telescope settle at most.
+_SETTLING_STEPS = 10
+#: Fraction of the mean square that another step would take away, below which they stay: 5e-5 of the merit.
+_SETTLED = 1e-4
 
 
 @dataclass(frozen=True)
@@ -233,6 +237,48 @@ class TolerancedMerit:
         """Return deviations [n, n_tolerance] with their compensators behind, [n, n_tolerance + n_compensator]."""
         return np.concatenate([deviations, self.moves(deviations)], axis=1)
 
+    def settled(self, values: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return deviations with compensators that settle from those given, and the criterion there as :meth:`traced`.
+
+        Derivatives change along large moves: a primary of f/2.5 whose radius is 0.3 % off moves the focus of an f/8
+        telescope by 77 mm, of which linear least squares leave 0.6 mm. Gauss-Newton steps on the traced telescope
+        follow until another one would hardly lessen the mean square.
+        """
+        if not self.combinations.size:
+            return values, self.traced(values)
+        try:
+            residuals = self.criterion.judge.residuals(self.telescope_at(values))
+            for _ in range(_SETTLING_STEPS):
+                # By the derivatives of the telescope as designed, which cost nothing.
+                if _is_small(self.by_free @ (self.setting @ residuals), residuals):
+                    break
+                slopes = self._derivatives(values)[1][:, len(self.tolerances) :] @ self.combinations
+                step, *_ = np.linalg.lstsq(slopes, -residuals, rcond=_DEPENDENT)
+                if _is_small(slopes @ step, residuals):
+                    break
+                values, residuals, moved = self._stepped(values, self.combinations @ step, residuals)
+                if not moved:
+                    break
+        except PachonError:
+            return values, self.traced(values)
+        if self.criterion.function is not None:
+            return values, self.traced(values)
+        return values, float(np.linalg.norm(residuals))
+
+    def _stepped(
+        self, values: np.ndarray, step: np.ndarray, residuals: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Return values with compensators a step farther, halved until the merit is less, and their residuals."""
+        for power in range(_HALVINGS):
+            stepped = values + np.append(np.zeros(len(self.tolerances)), 0.5**power * step)
+            try:
+                lessened = self.criterion.judge.residuals(self.telescope_at(stepped))
+            except PachonError:
+                continue
+            if lessened @ lessened < residuals @ residuals:
+                return stepped, lessened, True
+        return values, residuals, False
+
     def telescope_at(self, values: np.ndarray) -> Telescope:
         """Return the telescope at deviations and compensators, shape [n_tolerance + n_compensator]."""
         return apply(self.prepared, dict(zip(self.parameters, self.matrix @ values, strict=True)))
@@ -249,8 +295,13 @@ class TolerancedMerit:
 
     @cached_property
     def traced_nominal(self) -> float:
-        """Criterion of the telescope as designed, compensated to first order, in SI."""
-        return self.traced(self.compensated(np.zeros((1, len(self.tolerances))))[0])
+        """Criterion of the telescope as designed, compensated, in SI."""
+        return self.settled(self.compensated(np.zeros((1, len(self.tolerances))))[0])[1]
+
+
+def _is_small(change: np.ndarray, residuals: np.ndarray) -> bool:
+    """Return whether a change of the residuals along them is a small part of their mean square."""
+    return bool(change @ change <= _SETTLED * (residuals @ residuals))
 
 
 def _scaled_inverse(hessian: np.ndarray) -> np.ndarray:
