@@ -219,10 +219,11 @@ def monte_carlo(
 
     In the linear method the residuals of the merit are linear in the deviations, with their exact derivatives: a
     thousand draws cost little more than one. The merit itself, the root of a sum of squares, is not linearised. In
-    the quadratic method the sum of squares has its exact second derivatives, from differences of exact gradients.
-    The traced method traces each telescope. Compensators follow from linear least squares, in the quadratic method
-    from the quadratic itself, in the traced one from as many steps as each telescope needs. Rays fill the stop of
-    each telescope as in :func:`~pachon.design.optimize.optimize.optimize`.
+    the quadratic method the least sum of squares over the compensators has its second derivatives, from differences
+    of exact gradients. The traced method traces each telescope. Compensators follow from linear least squares, in
+    the traced method from as many steps as each telescope needs; those of the quadratic one are linear between
+    telescopes in which they are settled like that. Rays fill the stop of each telescope as in
+    :func:`~pachon.design.optimize.optimize.optimize`.
 
     Parameters
     ----------
