@@ -93,7 +93,8 @@ def optimize(
     ConfigError, UnknownNameError
         If a merit or variable does not exist, or an operand is given twice.
     DomainError
-        If the lens that the solver ends with has another merit, measured as it is saved, than that of the solver.
+        If the lens that the solver ends with loses the light of a field, or has another merit, measured as it is saved,
+        than that of the solver, though its apertures cut the same rays.
     """
     task = DesignTask(
         configurations(telescope, fields, wavelengths, n_pupil), merit_function(merit), tuple(targets), threads
