@@ -49,6 +49,9 @@ class Column(NamedTuple):
         unit = re.search(r"\[([^][]+)\]", self.title(summary))
         numbers = self.numbers(result, summary)
         values = range_text(numbers, self.form, unit[1] if unit else "")
+        missing = _rows_without_numbers(numbers)
+        if 0 < missing < len(numbers):
+            return f"{self.subject} is {values} at {len(numbers) - missing} of {len(numbers)} fields; others have none."
         over = f" over {len(numbers)} fields" if len(numbers) > 1 else ""
         return f"{self.subject} is {values}{over}."
 
@@ -73,6 +76,14 @@ def field_headings(result: Any) -> list[str]:
     """Return the field points of a result as headings of columns."""
     (name, values) = list(result.field_items().items())[-1]
     return [f"{text}°" if name == "field_deg" else f"{text} mm" for text in number_texts(values, ".4g")]
+
+
+def _rows_without_numbers(values: Any) -> int:
+    """Return the number of rows that have no finite number."""
+    import numpy as np
+
+    finite = np.isfinite(np.asarray(values, dtype=np.float64))
+    return int((~finite.reshape(len(finite), -1).any(axis=1)).sum()) if finite.ndim else 0
 
 
 def range_text(values: Any, form: str, unit: str = "") -> str:

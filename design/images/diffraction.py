@@ -238,7 +238,7 @@ class _Plan:
         if across > most:
             raise DomainError(
                 f"pixel = {self.pixel * 1e6:.4g} {self._unit}, pixels = {self.pixels}: the image would need {across} "
-                f"points across the pupil; expected at most {most} (a smaller image, or {instead})",
+                f"points across the pupil; expected at most {most} (a smaller image, {instead}, or rays alone)",
                 key="n_pupil",
             )
 

@@ -17,7 +17,7 @@ from ...models.io.glass_catalogue import GlassCatalogue
 from ...models.media.medium import LINE_D, Medium, abbe_number
 from ...models.parameters.parameters import Parameter
 from ...models.telescope import VACUUM, Telescope
-from .configuration import DesignConfiguration
+from .configuration import DesignConfiguration, configurations
 from .merit_function import MeritFunction, MeritName
 from .operand import Operand
 from .optimize import optimize
@@ -140,7 +140,7 @@ def choose_glasses(
     UnknownNameError
         If the telescope has no medium of a name.
     ConfigError
-        If no glass is named, or one twice.
+        If no glass is named, or one twice, or there is one wavelength alone.
     PachonError
         As :func:`~.optimize.optimize`.
     """
@@ -156,6 +156,9 @@ def choose_glasses(
     for name in names:
         if name not in medium_names:
             raise unknown_name(f"medium of {telescope.name}", name, sorted(medium_names))
+    (configuration,) = configurations(state, options.get("fields"), options.get("wavelengths"), options.get("n_pupil"))
+    if len(configuration.beams(telescope, options.get("threads")).request.wavelengths) < 2:
+        raise ConfigError("wavelengths: expected several, as glasses are chosen by their dispersion too")
     free = telescope
     for name in names:
         free = _with_medium(free, name, _medium_of(free, name), name + _MODEL)

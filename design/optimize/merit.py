@@ -5,6 +5,7 @@ The rays of a merit are those that are lit at the start; otherwise a merit could
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -28,6 +29,9 @@ from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
 
 #: Default points along the radius of the pupil.
 _RINGS = 6
+#: Factor from a reference sphere to a far one, and its largest radius [m]: paths to it are rounded to 2e-12 m.
+_FARTHER = 1e3
+_FARTHEST = 1e4
 
 
 @dataclass(frozen=True)
@@ -203,7 +207,8 @@ class WavefrontMerit:
     """
 
     def __init__(self, telescope: Telescope, beams: Beams, goal: Any = None) -> None:
-        self._beams = beams
+        self._beams, self._far = beams, False
+        self._has_goal = goal is not None
         weights = beams.weights(telescope)
         self._goal = np.zeros(weights.shape)
         if goal is not None:
@@ -225,11 +230,24 @@ class WavefrontMerit:
         tilts = self._roots[..., None] * np.stack([np.ones_like(x), x, y], axis=-1)
         self._basis = np.linalg.qr(tilts)[0]
 
+    def on_far_spheres(self) -> WavefrontMerit:
+        """Return the merit on reference spheres far away; itself with a goal, which is that on the nearer ones.
+
+        On the telescope's own sphere it is perfect where its focus lies on that sphere, however large its spots are.
+        """
+        if self._has_goal:
+            return self
+        far = copy(self)
+        far._far = True
+        return far
+
     def residuals(self, telescope: Telescope) -> np.ndarray:  # noqa: D102
         return self.derivatives(ParameterColumns.at(telescope, ()))[0]
 
     def derivatives(self, columns: ParameterColumns) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
         beams, parts = self._beams, []
+        if self._far:
+            columns = replace(columns, telescope=_with_far_sphere(columns.telescope))
         for i, wavelength in enumerate(beams.request.wavelengths):
             weights = columns.weights_at(float(wavelength))
 
@@ -255,3 +273,8 @@ class WavefrontMerit:
 
         total = sum(FieldWavefronts(columns, request, float(request.wavelengths[0])).map(squares))
         return np.sqrt(total / (len(request.fields) * len(request.pupil)))
+
+
+def _with_far_sphere(telescope: Telescope) -> Telescope:
+    radius = telescope.reference_sphere_radius
+    return replace(telescope, reference_sphere_radius=max(radius, min(_FARTHER * radius, _FARTHEST)))

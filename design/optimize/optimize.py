@@ -93,7 +93,8 @@ def optimize(
     ConfigError, UnknownNameError
         If a merit or variable does not exist, or an operand is given twice.
     DomainError
-        If the lens that the solver ends with has another merit, measured as it is saved, than that of the solver.
+        If the lens that the solver ends with loses the light of a field, or has another merit, measured as it is saved,
+        than that of the solver, though its apertures cut the same rays.
     """
     task = DesignTask(
         configurations(telescope, fields, wavelengths, n_pupil), merit_function(merit), tuple(targets), threads
@@ -108,12 +109,19 @@ def optimize(
     start, slopes = problem.linear(np.zeros(len(problem.variables)))
     effect = np.linalg.norm(slopes, axis=0)
     _check_effects(problem, effect)
-    solution = solver.solve(problem, box, bounds or {}, start, effect)
 
     def resume(changed: DesignProblem, changes: np.ndarray) -> np.ndarray:
         return solver.resume(changed, box, changes, effect)
 
-    end = settle(task, problem, held, solution.changes, resume, solver.constraint_tolerance)
+    # On the telescope's own reference spheres wavefronts have a second least, where the focus lies on the sphere.
+    far = problem.on_far_spheres()
+    if far is None:
+        solution = solver.solve(problem, box, bounds or {}, start, effect)
+        solved_changes = solution.changes
+    else:
+        solution = solver.solve(far, box, bounds or {}, far.linear(np.zeros(len(effect)))[0], effect)
+        solved_changes = resume(problem, solution.changes)
+    end = settle(task, problem, held, solved_changes, resume, solver.constraint_tolerance)
     values, slopes = end.problem.linear(end.changes)
     history = np.array([*solution.history, np.linalg.norm(values)])
     rate = np.array([v.rate(x) for v, x in zip(problem.variables, end.changes, strict=True)])

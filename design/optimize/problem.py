@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from ...core.errors import PachonError
 from ...models.parameters.parameters import apply
 from ...models.telescope import Telescope
 from .jacobian import ParameterColumns
-from .merit import Beams, Merit
+from .merit import Beams, Merit, WavefrontMerit
 from .operand import Operand
 from .variables import Variable
 
@@ -39,6 +39,19 @@ class DesignProblem:
     variables: Sequence[Variable]
     #: Numbers of residuals of the merits, then of the operands, of each state; once they are known.
     sizes: list[tuple[int, int]] = field(default_factory=list)
+
+    def on_far_spheres(self) -> DesignProblem | None:
+        """Return the problem with wavefronts on reference spheres far away; None where there are no spheres."""
+        merits = [
+            state.merit.on_far_spheres()
+            if isinstance(state.merit, WavefrontMerit) and not state.telescope.design_data.afocal
+            else state.merit
+            for state in self.states
+        ]
+        if all(merit is state.merit for merit, state in zip(merits, self.states, strict=True)):
+            return None
+        states = [replace(state, merit=merit) for state, merit in zip(self.states, merits, strict=True)]
+        return DesignProblem(states, self.variables)
 
     def telescopes(self, changes: np.ndarray) -> list[Telescope]:
         """Return the telescopes with changes applied."""

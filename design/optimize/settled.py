@@ -25,6 +25,7 @@ _ROUNDING = 1e-9
 _IMAGE_HEIGHTS = ("paraxial_image_height", "real_image_height")
 #: Most solutions after the first one.
 _ROUNDS = 12
+_LOST = "after the optimisation: hold the focal length by an operand, or limit the variables"
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,24 @@ class Settled:
     changes: np.ndarray
     telescopes: tuple[Telescope, ...]
     operands: tuple[OperandChange, ...]
+
+
+@dataclass(frozen=True)
+class _Round:
+    """One solution: what it is of, the telescopes as they are solved and saved, and the merits of both [m]."""
+
+    problem: DesignProblem
+    changes: np.ndarray
+    solved: tuple[Telescope, ...]
+    telescopes: tuple[Telescope, ...]
+    operands: tuple[OperandChange, ...]
+    merit: float
+    measured: float
+
+    @property
+    def rank(self) -> tuple[int, float]:
+        """Operands that do not hold, and the measured merit: the least is the best."""
+        return sum(not operand.holds for operand in self.operands), self.measured
 
 
 def settle(
@@ -50,48 +69,71 @@ def settle(
     Rays, fields and what operands take from a telescope are those of the start at first. They are made anew from the
     solution where its merit, measured on the telescopes as they are saved, is another one: where apertures cut other
     rays, or image heights are the fields and the magnification changes. `resume` solves a changed problem from changes.
+    Where apertures go on cutting other rays, the best solution by its measured merit is the end.
 
     Raises
     ------
     DomainError
-        If the measured merit differs from that of the solver by more than one per cent all the same.
+        If the light of a field is lost, or the measured merit differs from that of the solver by more than one per cent
+        for another reason than apertures.
     """
     start = task.measured([state.telescope for state in problem.states], filled=True)
     weighted_end = changes
+    rounds: list[_Round] = []
     for count in range(_ROUNDS + 1):
-        solved = problem.telescopes(changes)
-        telescopes = tuple(
-            final_telescope(lens, configuration.telescope)
-            for lens, configuration in zip(solved, task.configured, strict=True)
-        )
-        merit = float(np.linalg.norm(problem.merit_part(problem.residuals(changes))))
-        measured = task.measured(telescopes, filled=True)
-        same = abs(measured - merit) <= _DIFFERENT * merit + _ROUNDING * start
-        operands = _operand_changes(task, telescopes, tolerance)
-        moved = _moved_goals(held, operands)
+        end = _round_of(task, problem, changes, tolerance)
+        same = abs(end.measured - end.merit) <= _DIFFERENT * end.merit + _ROUNDING * start
+        if np.isfinite(end.measured):
+            rounds.append(end)
+        moved = _moved_goals(held, end.operands)
         if count == _ROUNDS or (same and not moved):
             break
+        solved = end.solved
         if any(goal.given_up for goal in moved):
             # What cannot be reached has drawn the telescope away from the others' solution.
             changes = weighted_end
             solved = problem.telescopes(changes)
-        states = problem.states if same else task.remade(solved)
+        try:
+            states = problem.states if same else task.remade(solved)
+        except DomainError as error:
+            if rounds:
+                break
+            raise DomainError(f"{error} {_LOST}") from None
         problem = DesignProblem(with_operands(states, held, solved), problem.variables)
         changes = resume(problem, changes)
-    if not same:
-        name = ", ".join(t.name for t in telescopes)
-        heights = any(t.design_data.fields and t.design_data.field_type in _IMAGE_HEIGHTS for t in telescopes)
-        advice = (
-            "; fields are image heights: hold focal length or magnification" if heights else "; limit the variables"
-        )
-        raise DomainError(
-            f"{name}: the rays of the optimisation have a merit of {merit:.6g} m at its end, and the telescope as it "
-            f"would be saved {measured:.6g} m: expected them within {_DIFFERENT:.0%}{advice}"
-        )
     stated = held_operands(task.operands, exactly=False)
-    return Settled(
-        DesignProblem(with_operands(problem.states, stated, solved), problem.variables), changes, telescopes, operands
+    states = end.problem.states
+    if not same:
+        if not rounds:
+            raise DomainError(f"{', '.join(t.name for t in end.telescopes)}: no light is measured {_LOST}")
+        end = min(rounds, key=lambda solution: solution.rank)
+        states = task.remade(end.solved)
+        remade = DesignProblem(with_operands(states, stated, end.solved), end.problem.variables)
+        residuals, _ = remade.linear(end.changes)
+        merit = float(np.linalg.norm(remade.merit_part(residuals)))
+        heights = any(t.design_data.fields and t.design_data.field_type in _IMAGE_HEIGHTS for t in end.telescopes)
+        if heights or not abs(end.measured - merit) <= _DIFFERENT * merit:
+            raise DomainError(
+                f"{', '.join(t.name for t in end.telescopes)}: the rays of the optimisation have a merit of "
+                f"{end.merit:.6g} m at its end, and the telescope as it would be saved {end.measured:.6g} m: expected "
+                f"them within {_DIFFERENT:.0%}; "
+                + ("fields are image heights: hold focal length or magnification" if heights else "limit the variables")
+            )
+    problem = DesignProblem(with_operands(states, stated, end.solved), end.problem.variables)
+    return Settled(problem, end.changes, end.telescopes, end.operands)
+
+
+def _round_of(task: DesignTask, problem: DesignProblem, changes: np.ndarray, tolerance: float) -> _Round:
+    """Return the solution of a problem at changes, measured."""
+    solved = tuple(problem.telescopes(changes))
+    telescopes = tuple(
+        final_telescope(lens, configuration.telescope)
+        for lens, configuration in zip(solved, task.configured, strict=True)
     )
+    merit = float(np.linalg.norm(problem.merit_part(problem.residuals(changes))))
+    measured = task.measured(telescopes, filled=True)
+    operands = _operand_changes(task, telescopes, tolerance)
+    return _Round(problem, changes, solved, telescopes, operands, merit, measured)
 
 
 def _moved_goals(held: HeldOperands, operands: tuple[OperandChange, ...]) -> list[HeldOperand]:

@@ -89,17 +89,21 @@ class MonteCarlo(Result):
         toleranced: TolerancedMerit,
         method: MonteCarloMethod,
         deviations: np.ndarray,
-        traced: np.ndarray | None,
+        traced: tuple[np.ndarray, np.ndarray] | None,
         nominal: float,
         **fields: Any,
     ) -> Self:
-        """Return the result for deviations: their `traced` merits, or those that the method computes.
+        """Return the result for deviations: their `traced` merits and compensators, or those that the method computes.
 
         Further `fields` are those of a subclass.
         """
         count, units = len(toleranced.tolerances), toleranced.degrees_of_freedom.units
-        if traced is None:
-            traced = toleranced.linear(deviations) if method == "linear" else toleranced.quadratic(deviations)
+        if traced is not None:
+            merit, moves = traced
+        elif method == "linear":
+            merit, moves = toleranced.linear(deviations), toleranced.moves(deviations)
+        else:
+            merit, moves = toleranced.quadratic(deviations), toleranced.quadratic_moves(deviations)
         return cls(
             telescope=toleranced.telescope.name,
             criterion=toleranced.criterion,
@@ -109,8 +113,8 @@ class MonteCarlo(Result):
             units=units[:count],
             compensator_units=units[count:],
             deviations=deviations,
-            moves=(toleranced.quadratic_moves if method == "quadratic" else toleranced.moves)(deviations),
-            merit=traced,
+            moves=moves,
+            merit=merit,
             nominal=nominal,
             contribution=toleranced.contribution,
             **fields,
@@ -214,10 +218,12 @@ def monte_carlo(
     """Return the merits of telescopes drawn within tolerances.
 
     In the linear method the residuals of the merit are linear in the deviations, with their exact derivatives: a
-    thousand draws cost little more than one. The merit itself, the root of a sum of squares, is not linearised. In the
-    quadratic method the sum of squares has its exact second derivatives, from differences of exact gradients. The
-    traced method traces each telescope. Compensators follow from linear least squares, in the quadratic method from the
-    quadratic itself. Rays fill the stop of each telescope as in :func:`~pachon.design.optimize.optimize.optimize`.
+    thousand draws cost little more than one. The merit itself, the root of a sum of squares, is not linearised. In
+    the quadratic method the least sum of squares over the compensators has its second derivatives, from differences
+    of exact gradients. The traced method traces each telescope. Compensators follow from linear least squares, in
+    the traced method from as many steps as each telescope needs; those of the quadratic one are linear between
+    telescopes in which they are settled like that. Rays fill the stop of each telescope as in
+    :func:`~pachon.design.optimize.optimize.optimize`.
 
     Parameters
     ----------
@@ -262,12 +268,13 @@ def monte_carlo(
     toleranced = TolerancedMerit.of(filled, tolerances, compensators, dof, criterion)
     if method != "traced":
         return MonteCarlo.of(toleranced, method, deviations, None, toleranced.nominal)
-    merits = np.empty(len(deviations))
-    for i, values in enumerate(toleranced.compensated(deviations)):
-        merits[i] = toleranced.traced(values)
+    merits, values = np.empty(len(deviations)), toleranced.compensated(deviations)
+    for i, linear in enumerate(values):
+        values[i], merits[i] = toleranced.settled(linear)
         if progress is not None:
             progress(1)
-    return MonteCarlo.of(toleranced, method, deviations, merits, toleranced.traced_nominal)
+    traced = merits, values[:, len(tolerances) :]
+    return MonteCarlo.of(toleranced, method, deviations, traced, toleranced.traced_nominal)
 
 
 @dataclass(frozen=True)

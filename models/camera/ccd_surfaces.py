@@ -150,7 +150,8 @@ def spline_weights(u: np.ndarray, m: int, order: int = 0) -> tuple[np.ndarray, n
     first derivatives with respect to `u` replace the values.
     """
     t = (u + 1.0) * (0.5 * (m - 3))
-    first = np.clip(np.floor(t).astype(np.int64), 0, m - 4)
+    # Of rays that do not arrive the place is NaN, and stays so.
+    first = np.clip(np.nan_to_num(np.floor(t)), 0, m - 4).astype(np.int64)
     f = t - first
     if order == 0:
         weights = ((1 - f) ** 3, 3 * f**3 - 6 * f**2 + 4, -3 * f**3 + 3 * f**2 + 3 * f + 1, f**3)

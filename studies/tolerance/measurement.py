@@ -18,6 +18,9 @@ LOWER = "lower end"
 UPPER = "upper end"
 INVERSE = "inverse"
 DRAW = "draw"
+#: Numbers of a point in the store: its merit, beside which compensators stand by name; or an inverse sensitivity.
+MERIT = "merit"
+SIZE = "size"
 #: Precision of an inverse sensitivity, a binary logarithm.
 _PRECISION = 1e-3
 #: Largest factor from a tolerance to its inverse sensitivity.
@@ -26,9 +29,14 @@ _FARTHEST = 1e4
 _NARROW = 0.1
 
 
+def moved_by(compensator: str) -> str:
+    """Return the name of the motion of a compensator."""
+    return f"{compensator} (compensator)"
+
+
 @dataclass(frozen=True)
 class Batch:
-    """Points that one worker computes, with deviations and compensators of each, shape [n, n_degree_of_freedom]."""
+    """Points that one worker computes, with deviations of each and compensators to first order, [n, n_freedom]."""
 
     points: tuple[SweepPoint, ...]
     values: np.ndarray
@@ -53,9 +61,11 @@ class ToleranceMeasurement:
         for point, values in zip(batch.points, batch.values, strict=True):
             start = time.perf_counter()
             if point.parameters["kind"] == INVERSE:
-                number = {"size": self._inverse(int(point.parameters["tolerance"]))}
+                number = {SIZE: self._inverse(int(point.parameters["tolerance"]))}
             else:
-                number = {"merit": self.toleranced.traced(values)}
+                settled, merit = self.toleranced.settled(values)
+                moves = zip(self.toleranced.compensators, settled[len(self.toleranced.tolerances) :], strict=True)
+                number = {MERIT: merit, **{moved_by(n): float(v) for n, v in moves}}
             results.append(PointResult(point.number, number, None, time.perf_counter() - start, worker_name()))
         return results
 
@@ -74,7 +84,7 @@ class ToleranceMeasurement:
             if power not in excesses:
                 ends = np.zeros((2, len(toleranced.tolerances)))
                 ends[:, index] = start * 2.0**power * np.array([-1.0, 1.0])
-                merits = [toleranced.traced(values) for values in toleranced.compensated(ends)]
+                merits = [toleranced.settled(values)[1] for values in toleranced.compensated(ends)]
                 losses = toleranced.criterion.loss(np.array(merits), nominal)
                 # A telescope that loses its light costs more than any that does not.
                 excesses[power] = float(np.max(np.where(np.isnan(losses), _FARTHEST * allowed, losses))) - allowed

@@ -12,6 +12,7 @@ from ...core.plotting import BLUE, GREY, ORANGE, RED, label_log_axis, new_figure
 from ...core.products import Columns, write_ecsv
 from ...core.version import VERSION
 from .file import ToleranceFile
+from .measurement import moved_by
 from .report import tolerance_page
 from .result import SHOWN, ToleranceStudy, merit_unit, name_rows, study_title
 
@@ -86,7 +87,7 @@ def write_tolerances(study: ToleranceStudy, file: ToleranceFile, folder: Path) -
     }
     draws: Columns = {"merit": (scale * study.merit, unit, about)}
     for i, name in enumerate(study.compensators):
-        draws[f"{name} (compensator)"] = (study.moves[:, i], _fits(study.compensator_units[i]), "")
+        draws[moved_by(name)] = (study.moves[:, i], _fits(study.compensator_units[i]), "")
     for i, tolerance in enumerate(study.tolerances):
         draws[tolerance.name] = (study.deviations[:, i], _fits(study.units[i]), "")
     write_ecsv(folder / "sensitivity.ecsv", sensitivity, {"what": "sensitivity to tolerances", **meta})

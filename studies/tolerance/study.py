@@ -23,7 +23,7 @@ from ...models.paraxial import following_stop
 from ...models.telescope import Telescope
 from ..sweep.store import PointResult, StoreKind, SweepPoint, open_store
 from .file import ToleranceFile
-from .measurement import DRAW, INVERSE, LOWER, NOMINAL, UPPER, Batch, ToleranceMeasurement
+from .measurement import DRAW, INVERSE, LOWER, MERIT, NOMINAL, SIZE, UPPER, Batch, ToleranceMeasurement, moved_by
 from .plan import tolerance_plan
 from .result import ToleranceStudy
 
@@ -82,13 +82,13 @@ def run_tolerances(
     deviations = draw(plan.tolerances, file.seed, file.draws)
     traced = file.method == "traced"
     points, values = _points(toleranced, deviations if traced else deviations[:0])
-    numbers = _numbers(measurement, points, values, file, store, execution or Execution())
+    numbers, moves = _numbers(measurement, points, values, file, store, execution or Execution())
     ends = numbers[1 : 1 + 2 * n].reshape(n, 2)
     return ToleranceStudy.of(
         toleranced,
         file.method,
         deviations,
-        numbers[1 + 3 * n :] if traced else None,
+        (numbers[1 + 3 * n :], moves[1 + 3 * n :]) if traced else None,
         float(numbers[0]),
         lower=ends[:, 0],
         upper=ends[:, 1],
@@ -131,24 +131,37 @@ def _numbers(
     file: ToleranceFile,
     path: str | os.PathLike[str] | None,
     execution: Execution,
-) -> np.ndarray:
-    """Return the result of every point; those that the store misses are computed, and written to it."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the result of every point, and its compensators, NaN of inverse sensitivities, [n_point, n_compensator].
+
+    Points that the store misses are computed, and written to it.
+    """
     numbers = np.full(len(points), np.nan)
+    names = [moved_by(name) for name in measured.toleranced.compensators]
+    moves = np.full((len(points), len(names)), np.nan)
     finished: set[int] = set()
+
+    def keep(result: PointResult) -> None:
+        metrics = result.metrics or {}
+        numbers[result.number] = metrics.get(MERIT, metrics.get(SIZE, np.nan))
+        moves[result.number] = [metrics.get(name, np.nan) for name in names]
+
     with ExitStack() as stack:
         store = None
         if path is not None:
             store = open_store(Path(path), file, lambda: points, resume=execution.resume, kind=STORE)
             stack.enter_context(store)
             for result in store.results():
-                numbers[result.number] = _number(result)
-                finished.add(result.number)
+                # Earlier versions left out the compensators, which were linear: such points are computed again.
+                if MERIT not in (result.metrics or {}) or set(names) <= set(result.metrics or {}):
+                    keep(result)
+                    finished.add(result.number)
 
         def save(batch: list[PointResult]) -> None:
             for result in batch:
                 if store is not None:
                     store.write(result)
-                numbers[result.number] = _number(result)
+                keep(result)
 
         open_points = [p for p in points if p.number not in finished]
         groups = [tuple(open_points[i : i + _BATCH]) for i in range(0, len(open_points), _BATCH)]
@@ -158,9 +171,4 @@ def _numbers(
         with execution.results(measured, labels, batches, title=title, save=save) as results:
             for _ in results:
                 pass
-    return numbers
-
-
-def _number(result: PointResult) -> float:
-    (value,) = (result.metrics or {"merit": np.nan}).values()
-    return value
+    return numbers, moves

@@ -237,7 +237,7 @@ def test_coatings(capsys, in_folder):
         (["psf", "lsst_v3.3_r", "--huygens", "--pupil-points", "64"], ("expected one of them",)),
         (
             ["psf", "lsst_v3.3_r", "--pixel-um", "200"],
-            ("points across the pupil", "(a smaller image, or --pupil-points)"),
+            ("points across the pupil", "(a smaller image, --pupil-points, or rays alone)"),
         ),
         (["psf", "lsst_v3.3_r", "--field-deg", "0", "--pupil-points", "16"], ("--pupil-points = 16: the pattern",)),
         (["mtf", "lsst_v3.3_r", "--field-deg", "1.7", "--pupil-points", "16"], ("--pupil-points = 16: too few",)),

@@ -6,6 +6,7 @@ import re
 import pytest
 
 from pachon.commands.cli import main
+from pachon.commands.tables import Column
 
 HEADER = """
 name: {name}
@@ -56,6 +57,15 @@ def test_a_footprint_says_which_surface_blocks_most(verdict):
     # The annulus from 0.2 to 0.25 m, to half of the widest of 24 rings of rays: at most pi/2 of 1/24 of their mean.
     assert percent == pytest.approx(100 * (1 - 0.8**2), abs=100 * math.pi / 4 / 24)
     assert verdict("footprint", "--field-deg", "0")[0] == "None of the surfaces blocks light."
+
+
+def test_fields_without_a_number_are_counted():
+    """A Strehl ratio of the axis alone was said to be that of all fields."""
+    column = Column("Strehl", lambda ratios: ratios, ".2f", subject="The ratio")
+    assert column.verdict([[0.9], [0.8]], {}) == "The ratio is 0.80 to 0.90 over 2 fields."
+    sentence = column.verdict([[0.9], [math.nan], [0.8]], {})
+    assert sentence == "The ratio is 0.80 to 0.90 at 2 of 3 fields; others have none."
+    assert column.verdict([[math.nan], [math.nan]], {}) == "The ratio is unknown over 2 fields."
 
 
 def test_a_seidel_diagram_names_the_largest_sum(verdict):

@@ -295,6 +295,9 @@ def test_glasses_stay_where_no_other_is_better(doublet, monkeypatch):
     assert found.optimum.merits[1] < found.optimum.merits[0]
     assert [trial.name for trial in found.trials] == ["N-BK7", "F2"]
     assert found.trials[1].rms < 0.1 * found.trials[0].rms
+    # At one wavelength an Abbe number has no effect, which was said of a variable that nobody had named.
+    with pytest.raises(ConfigError, match="wavelengths: expected several"):
+        pachon.design.choose_glasses(doublet, ACHROMAT, ["F2"], **{**how, "wavelengths": [D]})
 
 
 @pytest.mark.long

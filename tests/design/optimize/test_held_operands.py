@@ -1,11 +1,14 @@
 """Operands at the end of an optimisation: held exactly, or said not to be; merits that are the measured ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import pachon
 from pachon.core.errors import DomainError
 from pachon.design.optimize import design_task
+from pachon.models.aperture import Circle
 from pachon.models.parameters.parameters import apply
 from pachon.models.thickness import thickness
 
@@ -65,6 +68,32 @@ def test_a_merit_that_is_not_that_of_the_lens_is_an_error(singlet, monkeypatch):
         optimized(singlet, ["S2.thickness"], [])
     monkeypatch.setattr(design_task.DesignTask, "measured", lambda *args, **options: 1.005 * measured(*args, **options))
     optimized(singlet, ["S2.thickness"], [])
+
+
+@pytest.mark.long
+def test_apertures_that_cut_other_rays_of_each_solution():
+    """The best solution by its measured merit; an error had lost them all."""
+    telescope = pachon.models.two_mirror("ritchey-chretien", field_radius=np.deg2rad(0.3), primary_f_number=2.0)
+    secondary = telescope.surface("M2")
+    narrow = replace(secondary, aperture=Circle(0.701 * secondary.aperture.radius))
+    telescope = replace(telescope, surfaces=tuple(narrow if s is secondary else s for s in telescope.surfaces))
+    fields = np.deg2rad([[0.0, 0.0], [0.0, 0.2], [0.1, 0.27]])
+    found = pachon.optimize(telescope, ["M1.radius", "M2.radius"], "spots", fields, n_pupil=3)
+    spots = pachon.spots(pachon.Request.of(found.telescope, fields, n_pupil=3))
+    assert found.merits[1] == pytest.approx(np.sqrt(np.mean(spots.rms_radius**2)), rel=1e-9)
+    assert found.merits[1] == pytest.approx(found.history[-1], rel=0.01)
+    assert found.merits[1] < 0.7 * found.merits[0]
+
+
+@pytest.mark.long
+def test_light_that_an_optimisation_loses_is_said():
+    """A doublet gets sharper as its focal length grows, until stars fall beside its detector."""
+    lens = pachon.models.doublet(diameter=0.05, f_number=6.0, field_radius=np.deg2rad(1.0))
+    variables, fields = ["S1.radius", "S2.radius", "S3.thickness"], np.deg2rad([[0.0, 0.0], [0.0, 0.95]])
+    with pytest.raises(DomainError, match=r"no ray reaches the image of doublet after .* hold the focal length"):
+        pachon.optimize(lens, variables, "spots", fields, n_pupil=3)
+    held = pachon.optimize(lens, variables, "spots", fields, n_pupil=3, targets=[pachon.design.FocalLength(0.3)])
+    assert held.merits[1] < held.merits[0]
 
 
 @pytest.mark.parametrize("tolerance", [0.0, -1.0, np.nan])

@@ -286,6 +286,17 @@ def test_a_step_to_where_derivatives_end_is_made_shorter():
         LeastSquares().resume(BrokenProblem(-1.0), box, start, effect)
 
 
+def test_a_focus_on_the_reference_sphere_is_no_solution():
+    """Paths to a focus are equal, so that a lens whose focus lay on its sphere had 55 nm, and spots of 3 mm."""
+    lens = pachon.models.singlet(diameter=0.02, f_number=5.0, field_radius=np.deg2rad(2.0))
+    # Its first surface and the place of the detector, for another focal length.
+    target = FocalLength(0.22)
+    found = optimize(lens, ["S1.radius", "S2.thickness"], "wavefront", [[0.0, 0.0]], targets=[target], n_pupil=3)
+    spots = optimize(lens, ["S1.radius", "S2.thickness"], "spots", [[0.0, 0.0]], targets=[target], n_pupil=3)
+    assert found.values == pytest.approx(spots.values, rel=1e-3)
+    assert pachon.spots(found.telescope, [[0.0, 0.0]]).rms_radius[0] < 5e-6
+
+
 def test_a_random_start_without_derivatives_is_left_out():
     """Only the telescope as it is has derivatives; of the random starts most are beyond."""
     problem = BrokenProblem(1.5)

@@ -205,6 +205,17 @@ def test_measured_points_recover_a_known_surface():
     assert np.abs(error).max() < 200e-9
 
 
+def test_rays_that_do_not_arrive_have_no_slope_and_no_warning():
+    """Heights that cubic polynomials do not fit have splines beside them."""
+    u, v = (w.ravel() for w in np.meshgrid(np.linspace(-1, 1, 24), np.linspace(-1, 1, 24)))
+    plane = FocalPlane.from_heights({"x": u * HALF[0], "y": v * HALF[1], "z": 1e-6 * np.exp(-20.0 * (u**2 + v**2))})
+    assert plane.grid is not None
+    ccd = np.full(2, plane.ccd_index(plane.camera.ccd_names[int(plane.ccd_at(0.0, 0.0))]))
+    slopes = plane.slopes_on(ccd, np.array([0.3 * HALF[0], np.nan]), np.array([0.2 * HALF[1], 0.0]))
+    assert np.isfinite(slopes[0]).all()
+    assert np.isnan(slopes[1]).all()
+
+
 def test_noise_in_measured_points_averages_down():
     rng = np.random.default_rng(5)
     x, y = points_on([NAME], rng, 2000)

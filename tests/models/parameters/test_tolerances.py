@@ -10,13 +10,9 @@ import pytest
 import pachon
 from pachon.core.errors import ConfigError, DomainError, PachonError, UnknownNameError
 from pachon.core.files import json_text
-from pachon.design.optimize.merit import Beams
 from pachon.design.optimize.optimize import optimize
-from pachon.design.tolerancing.criterion import Criterion
 from pachon.design.tolerancing.monte_carlo import monte_carlo
-from pachon.design.tolerancing.toleranced_merit import TolerancedMerit
 from pachon.models.io.grid_file import write_grid
-from pachon.models.parameters.degrees_of_freedom import DegreesOfFreedom
 from pachon.models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
 from pachon.models.parameters.tolerances import Tolerance, draw
 from pachon.models.shapes.grid import GridSag
@@ -265,25 +261,11 @@ def test_quadratic_merit_where_compensators_do_not_respond_to_first_order(lsst_r
     assert quadratic == pytest.approx(traced, rel=1e-3)
 
 
-def test_quadratic_compensators_are_at_the_least_of_the_quadratic(lsst_r):
+def test_quadratic_compensators_are_those_of_telescopes_that_are_refocused(lsst_r):
     request = pachon.Request.of(lsst_r, FIELDS, n_pupil=4)
-    tolerances = (Tolerance("M2.dz", 3e-4), Tolerance("M2.rx", 1e-3))
-    compensators = ("Camera.dz", "Camera.rx")
-    result = monte_carlo(request, tolerances, n=3, seed=3, compensators=compensators, method="quadratic")
-    beams = Beams.of(request)
-    names = [*(t.name for t in tolerances), *compensators]
-    merit = TolerancedMerit.of(
-        lsst_r,
-        tolerances,
-        compensators,
-        DegreesOfFreedom.of_parameters(lsst_r, names),
-        Criterion.of("wavefront", lsst_r, beams),
-    )
-    start, gradient, hessian = merit.second_order
-    for deviations, moves, value in zip(result.deviations, result.moves, result.merit, strict=True):
-        place = np.concatenate([deviations, moves])
-        square = start + gradient @ place + 0.5 * place @ hessian @ place
-        assert np.sqrt(square) == pytest.approx(value, rel=1e-9)
-        slope = (gradient + hessian @ place)[2:]
-        # Rounding of terms that cancel.
-        assert np.all(np.abs(slope) < 1e-9 * np.abs(hessian[2:] * place).sum(axis=1))
+    tolerances = (Tolerance("M2.dz", 3e-5), Tolerance("M2.rx", 1e-4))
+    how = dict(n=3, seed=3, compensators=("Camera.dz", "Camera.rx"))
+    quadratic, traced = (monte_carlo(request, tolerances, method=m, **how) for m in ("quadratic", "traced"))
+    # Terms of second order, and a merit that is flat to 1e-4 about its least.
+    assert quadratic.moves == pytest.approx(traced.moves, rel=0.02, abs=1e-7)
+    assert quadratic.merit == pytest.approx(traced.merit, rel=1e-3)
