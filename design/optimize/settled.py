@@ -92,7 +92,7 @@ def settle(
         if any(goal.given_up for goal in moved):
             # What cannot be reached has drawn the telescope away from the others' solution.
             changes = weighted_end
-            solved = problem.telescopes(changes)
+            solved = tuple(problem.telescopes(changes))
         try:
             states = problem.states if same else task.remade(solved)
         except DomainError as error:
