@@ -103,7 +103,9 @@ class ImageConfig(Section):
     way: Literal["direct", "eigen"] = Field(
         "direct", description="direct (each galaxy under its own PSF), eigen (whole image, component by component)"
     )
-    interpolation: InterpolationName = Field("polynomial", description="of the PSF over the CCD: polynomial or kriging")
+    interpolation: InterpolationName | None = Field(
+        None, description="of the PSF over the CCD: polynomial, or kriging where that misses 3 % of the peak"
+    )
     side: Annotated[int, Field(strict=True, ge=64)] | None = Field(
         None, description="only the central square of a CCD [pixel]; by default all of it"
     )

@@ -31,6 +31,9 @@ RIM = 40
 SAMPLED_FWHM = 2.75
 #: Cells along a side of a pixel where they do not, one after the other until the cells sample the PSF.
 _CELLS = (3, 9)
+#: Error of polynomials over their PSFs, the median of the largest of each over its brightest pixel, beyond which they
+#: do not describe the field: CCDs of the LSST have 0.01, by turbulence, the corners of HSC 0.06 to 0.09.
+POLYNOMIAL_ERROR = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +61,7 @@ class PsfField:
         lit_fraction: ArrayLike | None = None,
         n_components: int | None = None,
         order: int = 4,
-        interpolation: InterpolationKey | Interpolation = "polynomial",
+        interpolation: InterpolationKey | Interpolation | None = None,
         cells: int = 1,
     ) -> PsfField:
         """Fit noise-free PSFs on one CCD.
@@ -75,7 +78,8 @@ class PsfField:
             [n], part of the entrance pupil whose light arrives; 1 by default.
         n_components, order, interpolation
             As in :meth:`pachon.PsfModel.fit`; 20 components or one less than the PSFs. The order is that of polynomials
-            alone.
+            alone. By default they are polynomials, and kriging where these are farther than :data:`POLYNOMIAL_ERROR`
+            from the PSFs, as at the rims of strongly vignetted fields.
         cells : int
             Cells of the stamps along a side of a pixel, an odd number: stamps then have so many times the pixels, and
             hold the light of each cell. Pixels of more than half the FWHM of the PSF do not sample it.
@@ -92,10 +96,16 @@ class PsfField:
         places = pure_numbers(positions, "positions")
         size = for_each(pure_numbers(pixels, "pixels"), 2, "pixels")
         extent = (-0.5, float(size[0]) - 0.5, -0.5, float(size[1]) - 0.5)
-        recipe = Recipe.of("paper", interpolation=interpolation, n_components=n_components)
-        if not recipe.interpolation.needs_noise:
-            recipe = recipe.changed(order=order)
-        model = PsfModel.fit(stamps, places, recipe=recipe, gain=None, extent=extent, clipping=None)
+
+        def fitted(interpolation: InterpolationKey | Interpolation) -> PsfModel:
+            recipe = Recipe.of("paper", interpolation=interpolation, n_components=n_components)
+            if not recipe.interpolation.needs_noise:
+                recipe = recipe.changed(order=order)
+            return PsfModel.fit(stamps, places, recipe=recipe, gain=None, extent=extent, clipping=None)
+
+        model = fitted("polynomial" if interpolation is None else interpolation)
+        if interpolation is None and _typical_error(model, np.asarray(stamps), places) > POLYNOMIAL_ERROR:
+            model = fitted("kriging")
         share = 1.0 if lit_fraction is None else lit_fraction
         light = for_each(pure_numbers(share, "lit_fraction"), len(places), "lit_fraction")
         terms = design_matrix(places, extent, order)
@@ -108,7 +118,7 @@ class PsfField:
         experiment: Experiment,
         ccd: str,
         *,
-        interpolation: InterpolationKey | Interpolation = "polynomial",
+        interpolation: InterpolationKey | Interpolation | None = None,
         threads: int | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> PsfField:
@@ -205,6 +215,12 @@ class PsfField:
 
     def _on_ccd(self, positions: ArrayLike) -> np.ndarray:
         return np.clip(np.atleast_2d(np.asarray(positions, dtype=np.float64)), -RIM, self.pixels + RIM)
+
+
+def _typical_error(model: PsfModel, stamps: np.ndarray, places: np.ndarray) -> float:
+    """Return the median over stars of the largest error of a model, in units of their brightest pixels."""
+    error = np.abs(model.at(places) - stamps).max(axis=(1, 2))
+    return float(np.median(error / stamps.max(axis=(1, 2))))
 
 
 def _with_cells(experiment: Experiment, cells: int) -> Experiment:

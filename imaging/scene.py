@@ -104,7 +104,7 @@ def draw_ccd(
     pointing: Any = (0.0, 0.0),
     window: Window | None = None,
     way: DrawingWay = "direct",
-    interpolation: InterpolationKey | Interpolation = "polynomial",
+    interpolation: InterpolationKey | Interpolation | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> CcdScene:
@@ -131,8 +131,8 @@ def draw_ccd(
         Part of the CCD; all of it by default.
     way : {"direct", "eigen"}
         How galaxies are convolved, as in :func:`~pachon.imaging.draw.draw_galaxies`.
-    interpolation : str or Interpolation
-        Of the PSF between the noise-free ones: polynomial or kriging.
+    interpolation : str or Interpolation, optional
+        Of the PSF between the noise-free ones: polynomial or kriging; by default as of :meth:`.PsfField.fit`.
     threads : int, optional
         Number of threads; all processors by default. No byte depends on it.
     progress : callable, optional

@@ -166,6 +166,27 @@ def test_kriging_interpolates_too(gaussian, psf_covariance):
     assert np.abs(np.fft.irfft2(spectrum, s=(21, 21)) - gaussian(21, psf_covariance(place))).max() < 1e-4
 
 
+@pytest.mark.parametrize(("width", "chosen"), [(2000.0, "polynomial"), (500.0, "kriging")])
+def test_polynomials_are_left_where_they_do_not_describe_the_psf(width, chosen):
+    # As at the rim of a vignetted field, where aberrations move the light by pixels.
+    y, x = np.indices((21, 21)) - 10.0
+    rng = np.random.default_rng(4)
+
+    def psfs(places):
+        moved = 3.0 * np.tanh((places[:, 0] - 2000.0) / width)
+        image = np.exp(-0.5 * ((x - moved[:, None, None]) ** 2 + y**2) / 4.0)
+        return image / image.sum(axis=(1, 2), keepdims=True)
+
+    places, others = rng.uniform(0.0, 4096.0, (100, 2)), rng.uniform(200.0, 3900.0, (50, 2))
+    fields = {
+        key: PsfField.fit(psfs(places), places, 4096, interpolation=key) for key in (None, "polynomial", "kriging")
+    }
+    drawn = {key: field.model.at(others) for key, field in fields.items()}
+    np.testing.assert_array_equal(drawn[None], drawn[chosen])
+    error = {key: np.abs(images - psfs(others)).max() for key, images in drawn.items()}
+    assert error[chosen] == min(error.values())
+
+
 def test_an_unknown_way_is_named(wcs, psf):
     with pytest.raises(ConfigError, match="way = 'fast': expected one of direct, eigen"):
         draw_galaxies(placed(wcs, np.array([[10.0, 10.0]])), np.ones(1), psf, wcs, way="fast")
