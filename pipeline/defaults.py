@@ -41,6 +41,8 @@ from .simulate.photometry import PROVISIONAL_FWHM, limiting_magnitude, saturatio
 from .simulate.screen_cover import check_screens, corner_fields
 
 _WAVELENGTHS = 5
+#: Name that stands for the CCDs in the middle of the field.
+CENTRAL = "central"
 #: Largest number of CCDs of a camera that is computed whole by default.
 _FEW = 9
 #: Site of telescopes that name none.
@@ -255,17 +257,27 @@ def configured_telescope(telescope: Telescope, config: Configuration) -> Telesco
 def chosen_ccds(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
     """Return the names of CCDs in the order of the camera, each once; rafts and ``all`` stand for all of theirs.
 
-    An unknown name raises UnknownNameError, none at all ConfigError.
+    ``central`` stands for the raft in the middle of the field, or without rafts for the nine CCDs nearest to it. An
+    unknown name raises UnknownNameError, none at all ConfigError.
     """
     indices: set[int] = set()
     for name in names:
         if name == "all":
             indices.update(range(len(camera)))
+        elif name == CENTRAL:
+            indices.update(_central_ccds(camera))
         else:
             indices.update(camera.members(name))
     if not indices:
         raise ConfigError(f"ccds = []: expected at least one name, such as {camera.ccd_names[0]}, or all")
     return tuple(camera.ccd_names[i] for i in sorted(indices))
+
+
+def _central_ccds(camera: Camera) -> np.ndarray:
+    """Return the indices of the CCDs of the raft in the middle of the field, or of as many nearest to it."""
+    nearest = np.argsort(np.hypot(*camera.centers.T), kind="stable")
+    raft = camera.raft_index[nearest[0]]
+    return np.flatnonzero(camera.raft_index == raft) if raft >= 0 else nearest[:_FEW]
 
 
 def default_ccds(camera: Camera) -> tuple[str, ...]:

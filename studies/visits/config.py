@@ -31,6 +31,7 @@ from ...pipeline.config import (
     with_options,
     with_run,
 )
+from ...pipeline.defaults import CENTRAL
 from ...pipeline.experiment import Experiment
 from ...pipeline.listed_visit import telescope_of_band
 from ...pipeline.resolved_values import require_drawn_stars
@@ -46,8 +47,6 @@ LIST_KEYS = tuple(f"visits.from_list.{key}" for key in SELECTION_KEYS)
 VISIT_STAMP = 49
 #: Largest distance of a listed pointing from the common one [deg], that of dithers.
 _LARGEST_FIELD = 5.0
-#: Raft of the visits where a configuration names no CCDs.
-CENTRAL_RAFT = "R22"
 
 
 class VisitsSection(Section):
@@ -98,13 +97,14 @@ class VisitsConfig(Section):
     def experiment(self, folder: Path | None = None) -> Experiment:
         """Return the experiment of all visits; relative paths in its configuration start from `folder`.
 
-        Where the run leaves them open, CCDs are those of the central raft: CCDs across the field share no sky.
+        Where the run leaves them open, CCDs are those in the middle of the field, of the LSST R22: CCDs across it share
+        no sky.
         """
         run = self.run
         if run.psf.stamp is None:
             run = with_options(run, psf__stamp=VISIT_STAMP)
         if run.ccds is None:
-            run = with_options(run, ccds=(CENTRAL_RAFT,))
+            run = with_options(run, ccds=(CENTRAL,))
         with error_context(key="run"):
             require_drawn_stars(run)
             return Experiment.from_config(run, folder)

@@ -3,6 +3,8 @@ import pytest
 
 import pachon
 from pachon.core.errors import DomainError
+from pachon.pipeline.config import Configuration
+from pachon.studies.visits.config import VisitsConfig
 from pachon.studies.visits.plan import Visit, plan_visits
 from pachon.studies.visits.sky_points import draw_points
 
@@ -102,3 +104,17 @@ def test_a_camera_turned_back_by_the_roll_stands_still_on_the_sky(lsst_r):
     turned = Visit(1, 1, roll=np.deg2rad(25.0), rotator_deg=25.0)
     found = turned.on_detector(lsst_r.with_rotator(np.deg2rad(turned.rotator_deg)), sky, LIGHT)
     np.testing.assert_allclose(found, still, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("telescope", "ccds"),
+    [
+        (None, tuple(f"R22_S{i}{j}" for i in range(3) for j in range(3))),
+        ("hsc", ("hsc034", "hsc041", "hsc042", "hsc049", "hsc050", "hsc057", "hsc058", "hsc065", "hsc066")),
+        ("decam", ("S3", "S4", "S5", "S10", "S11", "N3", "N4", "N10", "N11")),
+        ("auxtel", ("RXX_S00",)),
+    ],
+)
+def test_visits_of_every_camera_have_the_ccds_in_its_middle(telescope, ccds):
+    # Those of the LSST's raft R22 were asked of every camera.
+    assert VisitsConfig(run=Configuration(telescope=telescope)).experiment().config.ccds == ccds
