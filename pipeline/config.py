@@ -363,9 +363,7 @@ class Configuration(Section):
     camera: str | None = Field(
         None, description="bundled camera, or path of a camera file, in place of the telescope's own"
     )
-    ccds: Annotated[tuple[str, ...] | None, BeforeValidator(_listed)] = Field(
-        None, description="CCDs to compute: names, rafts, all or central"
-    )
+    ccds: Annotated[tuple[str, ...] | None, BeforeValidator(_listed)] = Field(None, description="CCDs, rafts, central")
     seed: Whole = Field(1, description="seed of all random numbers")
     changes: dict[str, Real] = Field(
         default_factory=dict, description="changes of the prescription: {M2.dz_um: 10, Camera.rx_urad: 5, M1.Z5_nm: 20}"

@@ -261,6 +261,6 @@ def test_ranges_leave_out_what_is_no_number():
     column = Column("rms [µm]", "rms_um", ".2f", 1.0, "The rms radius of the spots")
     assert (
         column.verdict(None, {"rms_um": np.array([1.0, NAN])})
-        == "The rms radius of the spots is 1.00 µm over 2 fields."
+        == "The rms radius of the spots is 1.00 µm at 1 of 2 fields; others have none."
     )
     assert column.verdict(None, {"rms_um": np.array([NAN])}) == "The rms radius of the spots is unknown."
