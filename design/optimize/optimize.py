@@ -114,14 +114,12 @@ def optimize(
         return solver.resume(changed, box, changes, effect)
 
     # On the telescope's own reference spheres wavefronts have a second least, where the focus lies on the sphere.
-    far = problem.on_far_spheres()
-    if far is None:
-        solution = solver.solve(problem, box, bounds or {}, start, effect)
-        solved_changes = solution.changes
-    else:
-        solution = solver.solve(far, box, bounds or {}, far.linear(np.zeros(len(effect)))[0], effect)
-        solved_changes = resume(problem, solution.changes)
-    end = settle(task, problem, held, solved_changes, resume, solver.constraint_tolerance)
+    first = problem.on_far_spheres()
+    if first is not problem:
+        start, _ = first.linear(np.zeros(len(effect)))
+    solution = solver.solve(first, box, bounds or {}, start, effect)
+    solved = solution.changes if first is problem else resume(problem, solution.changes)
+    end = settle(task, problem, held, solved, resume, solver.constraint_tolerance)
     values, slopes = end.problem.linear(end.changes)
     history = np.array([*solution.history, np.linalg.norm(values)])
     rate = np.array([v.rate(x) for v, x in zip(problem.variables, end.changes, strict=True)])

@@ -40,8 +40,8 @@ class DesignProblem:
     #: Numbers of residuals of the merits, then of the operands, of each state; once they are known.
     sizes: list[tuple[int, int]] = field(default_factory=list)
 
-    def on_far_spheres(self) -> DesignProblem | None:
-        """Return the problem with wavefronts on reference spheres far away; None where there are no spheres."""
+    def on_far_spheres(self) -> DesignProblem:
+        """Return the problem with wavefronts on reference spheres far away; itself where there are no spheres."""
         merits = [
             state.merit.on_far_spheres()
             if isinstance(state.merit, WavefrontMerit) and not state.telescope.design_data.afocal
@@ -49,7 +49,7 @@ class DesignProblem:
             for state in self.states
         ]
         if all(merit is state.merit for merit, state in zip(merits, self.states, strict=True)):
-            return None
+            return self
         states = [replace(state, merit=merit) for state, merit in zip(self.states, merits, strict=True)]
         return DesignProblem(states, self.variables)
 

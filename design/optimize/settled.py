@@ -25,6 +25,7 @@ _ROUNDING = 1e-9
 _IMAGE_HEIGHTS = ("paraxial_image_height", "real_image_height")
 #: Most solutions after the first one.
 _ROUNDS = 12
+#: What is said of light that the solver has lost.
 _LOST = "after the optimisation: hold the focal length by an operand, or limit the variables"
 
 
@@ -49,6 +50,11 @@ class _Round:
     operands: tuple[OperandChange, ...]
     merit: float
     measured: float
+
+    @property
+    def names(self) -> str:
+        """Names of the telescopes, for messages."""
+        return ", ".join(telescope.name for telescope in self.telescopes)
 
     @property
     def rank(self) -> tuple[int, float]:
@@ -101,26 +107,29 @@ def settle(
             raise DomainError(f"{error} {_LOST}") from None
         problem = DesignProblem(with_operands(states, held, solved), problem.variables)
         changes = resume(problem, changes)
-    stated = held_operands(task.operands, exactly=False)
-    states = end.problem.states
     if not same:
         if not rounds:
-            raise DomainError(f"{', '.join(t.name for t in end.telescopes)}: no light is measured {_LOST}")
+            raise DomainError(f"{end.names}: no light is measured {_LOST}")
         end = min(rounds, key=lambda solution: solution.rank)
-        states = task.remade(end.solved)
-        remade = DesignProblem(with_operands(states, stated, end.solved), end.problem.variables)
-        residuals, _ = remade.linear(end.changes)
-        merit = float(np.linalg.norm(remade.merit_part(residuals)))
-        heights = any(t.design_data.fields and t.design_data.field_type in _IMAGE_HEIGHTS for t in end.telescopes)
-        if heights or not abs(end.measured - merit) <= _DIFFERENT * merit:
-            raise DomainError(
-                f"{', '.join(t.name for t in end.telescopes)}: the rays of the optimisation have a merit of "
-                f"{end.merit:.6g} m at its end, and the telescope as it would be saved {end.measured:.6g} m: expected "
-                f"them within {_DIFFERENT:.0%}; "
-                + ("fields are image heights: hold focal length or magnification" if heights else "limit the variables")
-            )
+    stated = held_operands(task.operands, exactly=False)
+    states = end.problem.states if same else task.remade(end.solved)
     problem = DesignProblem(with_operands(states, stated, end.solved), end.problem.variables)
+    if not same:
+        _require_merit(end, problem)
     return Settled(problem, end.changes, end.telescopes, end.operands)
+
+
+def _require_merit(end: _Round, remade: DesignProblem) -> None:
+    """Raise DomainError where a solution has another measured merit than with the rays that its apertures leave."""
+    residuals, _ = remade.linear(end.changes)
+    merit = float(np.linalg.norm(remade.merit_part(residuals)))
+    heights = any(t.design_data.fields and t.design_data.field_type in _IMAGE_HEIGHTS for t in end.telescopes)
+    if heights or not abs(end.measured - merit) <= _DIFFERENT * merit:
+        advice = "fields are image heights: hold focal length or magnification" if heights else "limit the variables"
+        raise DomainError(
+            f"{end.names}: the rays of the optimisation have a merit of {end.merit:.6g} m at its end, and the "
+            f"telescope as it would be saved {end.measured:.6g} m: expected them within {_DIFFERENT:.0%}; {advice}"
+        )
 
 
 def _round_of(task: DesignTask, problem: DesignProblem, changes: np.ndarray, tolerance: float) -> _Round:
