@@ -360,10 +360,10 @@ class Configuration(Section):
 
     band: BandName | None = Field(None, description="filter: u, g, r, i, z or y")
     telescope: str | None = Field(None, description="bundled model (pachon info lists them), or path of a prescription")
-    camera: str | None = Field(
-        None, description="bundled camera, or path of a camera file, in place of the telescope's own"
+    camera: str | None = Field(None, description="bundled camera, or path of a file, in place of the telescope's own")
+    ccds: Annotated[tuple[str, ...] | None, BeforeValidator(_listed)] = Field(
+        None, description="CCDs or rafts to compute; central: those in the middle of the field; all"
     )
-    ccds: Annotated[tuple[str, ...] | None, BeforeValidator(_listed)] = Field(None, description="CCDs, rafts, central")
     seed: Whole = Field(1, description="seed of all random numbers")
     changes: dict[str, Real] = Field(
         default_factory=dict, description="changes of the prescription: {M2.dz_um: 10, Camera.rx_urad: 5, M1.Z5_nm: 20}"
