@@ -20,7 +20,6 @@ from scipy import fft
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, check_choice
 from ..core.threads import one_blas_thread, thread_count
-from ..sky.mosaic import PlantedGalaxies
 from .psf_field import PsfField
 
 DrawingWay = Literal["direct", "eigen"]
@@ -71,6 +70,9 @@ class Sources(Protocol):
 
     def light_beyond(self, distance: np.ndarray) -> np.ndarray:
         """Return the largest light of galaxies of unit flux at a distance [rad] or beyond [1/rad^2]."""
+
+    def on_cells(self, cells: int) -> Sources:
+        """Return the same galaxies with transforms for pixels so many times finer."""
 
     def transform(
         self, indices: Any, jacobian: np.ndarray, offset: np.ndarray, size: int, *, threads: int | None = None
@@ -200,13 +202,17 @@ def grid_sizes(
     noise : float or ndarray, shape [n]
         rms noise of a pixel [electron].
     """
-    sizes = np.full(len(electrons), SIZES[-1])
-    for size in reversed(SIZES[:-1]):
+    sizes, waiting = np.full(len(electrons), SIZES[-1]), np.arange(len(electrons))
+    limit = np.broadcast_to(_WRAPPED * np.asarray(noise), sizes.shape)
+    for size in SIZES[:-1]:
         # A pixel of margin for the place of the galaxy between pixels.
         edge = size // 2 - 1
         star = profile[edge] if edge < len(profile) else 0.0
-        rim = galaxies.light_beyond((edge - _BLUR) / scale) / scale**2
-        sizes[electrons * (star + rim) < _WRAPPED * noise] = size
+        rim = galaxies.light_beyond((edge - _BLUR) / scale[waiting]) / scale[waiting] ** 2
+        held = electrons[waiting] * (star + rim) < limit[waiting]
+        sizes[waiting[held]] = size
+        # The smallest grid holds nearly all.
+        waiting, galaxies = waiting[~held], galaxies.take(~held)
     return sizes
 
 
@@ -241,7 +247,7 @@ def _draw_direct(
     sizes = grid_sizes(galaxies, electrons, scale, profile, noise)
     nearest = np.rint(pixels).astype(np.int64)
     cells = 1 if psf is None else psf.cells
-    if cells > 1 and isinstance(galaxies, PlantedGalaxies):
+    if cells > 1:
         galaxies = galaxies.on_cells(cells)
     amplitudes = np.ones((len(pixels), 1)) if psf is None else psf.amplitudes(pixels)
     amplitudes = (electrons[:, None] * amplitudes).astype(np.float32)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
-from scipy.special import gammaln
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, shown
@@ -19,7 +18,7 @@ from ..core.result import Result
 from ..core.units import ARCMIN, broadcast_together, for_each, pure_numbers, radians
 from ..core.warp_arrays import warp_array
 from .galaxy_kernels import transform_galaxies
-from .sersic import GREATEST_INDEX, INDICES, LEAST_INDEX, sersic_table
+from .sersic import GREATEST_INDEX, INDICES, LEAST_INDEX, sersic_brightness, sersic_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -212,15 +211,17 @@ class Galaxies(Result):
     def light_beyond(self, distance: np.ndarray) -> np.ndarray:
         """Return the largest light of galaxies of unit flux at distances from their centres [rad] or beyond [1/rad^2].
 
-        Both [n]; that of the components on their major axes, with b of the profiles to 1e-3 (Ciotti & Bertin 1999).
+        Both [n]; that of the components on their major axes.
         """
-        n, e = self.sersic, np.hypot(self.e1, self.e2)
-        b = 2.0 * n - 1.0 / 3.0 + 4.0 / (405.0 * n)
-        major = self.component_radius * np.sqrt((1.0 + e) / (1.0 - e))
-        middle = np.exp(2.0 * n * np.log(b) - gammaln(2.0 * n)) / (2.0 * np.pi * n * self.component_radius**2)
+        e, radius = np.hypot(self.e1, self.e2), self.component_radius
+        major = radius * np.sqrt((1.0 + e) / (1.0 - e))
         from_component = np.maximum(np.asarray(distance)[self.owner] - np.hypot(self.dx, self.dy), 0.0)
-        light = self.fraction * middle * np.exp(-b * (from_component / major) ** (1.0 / n))
+        light = self.fraction * sersic_brightness(self.sersic, from_component / major) / radius**2
         return np.add.reduceat(light, self.first[:-1]) if len(self) else np.zeros(0)
+
+    def on_cells(self, cells: int) -> Galaxies:
+        """Return the galaxies, whose transforms are exact on pixels of any size."""
+        return self
 
     def transform(
         self, indices: Any, jacobian: np.ndarray, offset: np.ndarray, size: int, *, threads: int | None = None

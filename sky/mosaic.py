@@ -24,6 +24,7 @@ from ..core.warp_arrays import warp_array
 from .cells import SIDE, Cell, Region, poisson_arrivals
 from .cutouts import Cutouts, cut_galaxies, read_mosaic
 from .galaxies import grid_arguments, reduced_shear
+from .sersic import sersic_brightness
 from .stamp_kernels import transform_stamps
 
 if TYPE_CHECKING:
@@ -257,8 +258,7 @@ class PlantedGalaxies:
 
     def light_beyond(self, distance: np.ndarray) -> np.ndarray:
         """Return the largest light as :meth:`Galaxies.light_beyond`, of the law of de Vaucouleurs."""
-        # Ciotti & Bertin 1999: I = L / (22.665 r^2) exp(-7.669 ((R/r)^(1/4) - 1)).
-        return np.exp(-7.669 * ((distance / self.radius) ** 0.25 - 1.0)) / (22.665 * self.radius**2)
+        return sersic_brightness(4.0, distance / self.radius) / self.radius**2
 
     def on_cells(self, cells: int) -> PlantedGalaxies:
         """Return the same galaxies with transforms for pixels so many times finer."""
