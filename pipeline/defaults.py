@@ -89,6 +89,9 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     with error_context(key=None if config.telescope is None else "telescope"):
         telescope = load_telescope(name)
     named_band = _band_of(name, telescope)
+    of_band = f"{name.removesuffix(f'_{named_band}')}_{band}"
+    if name != of_band and of_band in BUNDLED:
+        raise ConfigError(f"band = {band}: telescope {name} has filter {named_band}; expected {of_band}", key="band")
     camera_name = None
     if config.camera is not None:
         camera_name = _absolute_path(config.camera, folder, CAMERAS, CAMERA_ENDINGS)

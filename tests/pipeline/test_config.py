@@ -165,6 +165,9 @@ def test_the_default_goes_from_the_centre_to_the_edge_of_the_field():
 def test_band_and_telescope_follow_each_other():
     assert Experiment.from_config(with_options(Configuration(), band="i")).config.telescope == "lsst_v3.3_i"
     assert Experiment.from_config(with_options(Configuration(), telescope="lsst_v3.3_z")).config.band == "z"
+    # Its filter is of another thickness, so that light of g would be out of focus.
+    with pytest.raises(ConfigError, match=r"band = g: telescope lsst_v3\.3_r has filter r; expected lsst_v3\.3_g"):
+        Experiment.from_config(with_options(Configuration(), telescope="lsst_v3.3_r", band="g"))
 
 
 def test_without_an_atmosphere_pixels_and_weight_are_finer():
