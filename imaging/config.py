@@ -11,7 +11,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -21,7 +20,6 @@ from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, ProductError, error_context
 from ..core.files import content_hash
 from ..core.schema import Count, Positive, Real, Section, Switch, plain_number, validated
-from ..models.camera.photometry import PIXEL_SCALE
 from ..pipeline.config import (
     Configuration,
     InterpolationName,
@@ -30,11 +28,11 @@ from ..pipeline.config import (
     read_configuration,
     refuse_retired_interpolation,
     section_yaml,
-    with_options,
     with_run,
 )
 from ..pipeline.experiment import Experiment
 from ..pipeline.listed_visit import visit_experiment
+from ..pipeline.wide_stamps import with_stamps
 from ..sky.visit_list.visit_list import ListedVisit
 
 #: Pixels along a side of the PSF's stamps where the run leaves them open, as many arcseconds as of the LSST's on finer
@@ -160,19 +158,6 @@ class ImagesConfig(Section):
     def to_yaml(self) -> str:
         """Return the configuration as a YAML file."""
         return section_yaml(self, "All that decides these images.")
-
-
-def with_stamps(experiment: Experiment, run: Configuration, pixels: int) -> Experiment:
-    """Return an experiment whose stamps have so many pixels, or on finer ones the angle of those of the LSST.
-
-    The experiment itself where the configuration of the run has a stamp.
-    """
-    if run.psf.stamp is not None:
-        return experiment
-    pixel = experiment.band.pixel_scale
-    # An odd number, of which no rounding of an angle makes the next.
-    wide = 2 * math.ceil(0.5 * (pixels * PIXEL_SCALE / pixel - 1.0) - 1e-3) + 1
-    return replace(experiment, config=with_options(experiment.config, psf__stamp=max(pixels, wide)))
 
 
 @check_arguments

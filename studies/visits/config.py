@@ -35,15 +35,16 @@ from ...pipeline.defaults import CENTRAL
 from ...pipeline.experiment import Experiment
 from ...pipeline.listed_visit import telescope_of_band
 from ...pipeline.resolved_values import require_drawn_stars
+from ...pipeline.wide_stamps import with_stamps
 from ...sky.pointing import Pointing
 from ..night.config import SELECTION_KEYS, ListSection, read_section
 from .plan import Visit, listed_plan, plan_visits
 
-#: Side of the stamps of the stack [pixel].
+#: Side of the stamps of the stack [pixel], as wide on the sky as of the LSST's where pixels are finer.
 STACK_STAMP = 31
 #: Keys that a list of the same visits may have otherwise.
 LIST_KEYS = tuple(f"visits.from_list.{key}" for key in SELECTION_KEYS)
-#: Side of the stamps of a visit [pixel], of which turned axes cut the corners.
+#: Side of the stamps of a visit [pixel], likewise, of which turned axes cut the corners.
 VISIT_STAMP = 49
 #: Largest distance of a listed pointing from the common one [deg], that of dithers.
 _LARGEST_FIELD = 5.0
@@ -101,13 +102,11 @@ class VisitsConfig(Section):
         no sky.
         """
         run = self.run
-        if run.psf.stamp is None:
-            run = with_options(run, psf__stamp=VISIT_STAMP)
         if run.ccds is None:
             run = with_options(run, ccds=(CENTRAL,))
         with error_context(key="run"):
             require_drawn_stars(run)
-            return Experiment.from_config(run, folder)
+            return with_stamps(Experiment.from_config(run, folder), run, VISIT_STAMP)
 
     def resolved(self, experiment: Experiment) -> VisitsConfig:
         """Return the configuration with every default of the run filled in."""

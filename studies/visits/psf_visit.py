@@ -30,6 +30,7 @@ from ...pipeline.simulate.photometry import (
 )
 from ...pipeline.simulate.screen_cover import check_screens
 from ...pipeline.simulate.star_field import StarField, magnitudes_at
+from ...pipeline.wide_stamps import stamp_side
 from ...reconstruction.focal_plane_psf.stars import CcdStars, FocalPlaneStars
 from ...reconstruction.psf_model.fit import CcdStars as ModelStars
 from ..night.detector_row import noise_columns
@@ -62,10 +63,11 @@ class StackFrame:
     size: int
 
     @classmethod
-    def of(cls, experiment: Experiment, size: int) -> StackFrame:
-        """Return the frame of an experiment."""
+    def of(cls, experiment: Experiment, pixels: int) -> StackFrame:
+        """Return the frame of an experiment, with stamps as wide on the sky as so many pixels of the LSST."""
         center = Visit(0, 0).jacobians(experiment.telescope, np.zeros((1, 2)), middle_wavelength(experiment))[0]
         u, scale, vt = np.linalg.svd(center)
+        size = stamp_side(pixels, experiment.band.pixel_scale)
         return cls(u @ vt * scale.mean() / experiment.pixel_size, size)
 
     @property

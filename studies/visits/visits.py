@@ -123,9 +123,9 @@ def stack_visits(
             execution.reporter.line(f"{listed.source}: {remark}")
     check_rotators(experiment, visits)
     make_folder(folder)
-    _check_room(folder, points, len(config.kept))
+    _check_room(folder, points, frame, len(config.kept))
     claim_visits(folder, config, resume=execution.resume)
-    sums = _sums_so_far(folder, stamp, len(points), execution.resume)
+    sums = _sums_so_far(folder, stamp, PsfSums.empty(len(points), frame.size), execution.resume)
     if sums.visits > len(visits):
         stacked = counted(sums.visits, "visit")
         raise ProductError(f"{folder} holds {stacked}: expected at most {len(visits)}; choose another --out")
@@ -221,16 +221,14 @@ def claim_visits(folder: Path, config: VisitsConfig, *, resume: bool) -> None:
     )
 
 
-def _sums_so_far(folder: Path, stamp: Stamp, n: int, resume: bool) -> PsfSums:
+def _sums_so_far(folder: Path, stamp: Stamp, empty: PsfSums, resume: bool) -> PsfSums:
     path = folder / SUMS_NAME
-    if resume and path.exists():
-        return PsfSums.read(path, stamp)
-    return PsfSums.empty(n, STACK_STAMP)
+    return PsfSums.read(path, stamp) if resume and path.exists() else empty
 
 
-def _check_room(folder: Path, points: SkyPoints, stacks: int) -> None:
+def _check_room(folder: Path, points: SkyPoints, frame: StackFrame, stacks: int) -> None:
     """Raise DomainError where the disk cannot hold the sums, twice while they are replaced, and the stacks."""
-    needed = 2 * 4 * STACK_STAMP**2 * len(points) * (2 + stacks)
+    needed = 2 * 4 * frame.size**2 * len(points) * (2 + stacks)
     free = shutil.disk_usage(folder).free
     if needed > free:
         raise DomainError(f"{folder}: the stacks need {readable(needed)} of disk, {readable(free)} are free")

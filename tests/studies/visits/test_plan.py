@@ -3,9 +3,10 @@ import pytest
 
 import pachon
 from pachon.core.errors import DomainError
-from pachon.pipeline.config import Configuration
-from pachon.studies.visits.config import VisitsConfig
+from pachon.pipeline.config import Configuration, with_options
+from pachon.studies.visits.config import STACK_STAMP, VisitsConfig
 from pachon.studies.visits.plan import Visit, plan_visits
+from pachon.studies.visits.psf_visit import StackFrame
 from pachon.studies.visits.sky_points import draw_points
 
 LIGHT = 620e-9
@@ -118,3 +119,12 @@ def test_a_camera_turned_back_by_the_roll_stands_still_on_the_sky(lsst_r):
 def test_visits_of_every_camera_have_the_ccds_in_its_middle(telescope, ccds):
     # Those of the LSST's raft R22 were asked of every camera.
     assert VisitsConfig(run=Configuration(telescope=telescope)).experiment().config.ccds == ccds
+
+
+def test_stamps_cover_the_same_angle_on_every_camera():
+    # 49 and 31 pixels of AuxTel are 4.7 and 3.0 arcsec of the 9.8 and 6.2 of the LSST.
+    for telescope, in_visits, in_stacks in ((None, 49, 31), ("auxtel", 103, 65), ("decam", 49, 31)):
+        experiment = VisitsConfig(run=Configuration(telescope=telescope)).experiment()
+        assert (experiment.config.psf.stamp, StackFrame.of(experiment, STACK_STAMP).size) == (in_visits, in_stacks)
+    given = VisitsConfig(run=with_options(Configuration(telescope="auxtel"), psf__stamp=61))
+    assert given.experiment().config.psf.stamp == 61
