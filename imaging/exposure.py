@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.random_streams import stream
-from ..core.threads import thread_count
+from ..core.threads import one_blas_thread, thread_count
 from ..core.units import pure_numbers, require_positive
 from ..models.camera.photometry import DARK_CURRENT, FULL_WELL, PIXEL_SCALE, READ_NOISE, Band, BandName
 from ..pipeline.experiment import Experiment
@@ -133,9 +134,8 @@ class Exposure:
 
     @property
     def background(self) -> float:
-        """Expected electrons of sky and dark current in a pixel."""
-        sky = sky_electrons_per_pixel(self._band, self.total_time, self.pixel_scale, sky=self.sky)
-        return sky + self.dark_current * self.total_time
+        """Expected electrons of sky and dark current in a pixel, without vignetting."""
+        return float(self.background_of(1.0))
 
     @property
     def well(self) -> float:
@@ -143,19 +143,19 @@ class Exposure:
         return self.exposures * self.full_well
 
     @property
-    def subtracted(self) -> float:
-        """Electrons that are subtracted from each pixel."""
-        return self.background if self.subtract_background else 0.0
-
-    @property
     def saturation_level(self) -> float:
-        """Value of saturated pixels [ADU], to the last bit."""
-        return float(np.float32((self.well - self.subtracted) / self.gain))
+        """Least value of saturated pixels [ADU], to the last bit; vignetted ones have less subtracted."""
+        return float(np.float32((self.well - (self.background if self.subtract_background else 0.0)) / self.gain))
 
     @property
     def noise_rms(self) -> float:
-        """Noise of a pixel without sources, rms [electron]."""
+        """Noise of a pixel without sources and vignetting, rms [electron]."""
         return float(np.sqrt(self.background + self.exposures * self.read_noise**2))
+
+    def background_of(self, lit_fraction: float | np.ndarray) -> float | np.ndarray:
+        """Return the expected electrons of sky and dark current in pixels where a part of the sky's light arrives."""
+        sky = sky_electrons_per_pixel(self._band, self.total_time, self.pixel_scale, sky=self.sky)
+        return sky * lit_fraction + self.dark_current * self.total_time
 
     def electrons(self, magnitude: ArrayLike) -> np.ndarray:
         """Return the electrons of sources of AB magnitudes above the atmosphere; NaN of NaN."""
@@ -180,7 +180,12 @@ class ExposedImage:
 
 
 def expose(
-    scene: np.ndarray, exposure: Exposure, seed: int, *key: str | int, threads: int | None = None
+    scene: np.ndarray,
+    exposure: Exposure,
+    seed: int,
+    *key: str | int,
+    lit_fraction: Callable[[slice], np.ndarray] | None = None,
+    threads: int | None = None,
 ) -> ExposedImage:
     """Expose a noise-free scene.
 
@@ -198,6 +203,9 @@ def expose(
         Seed.
     *key : str or int
         Name of the random stream, such as those of CCD and visit. Bands of 128 rows have their own.
+    lit_fraction : callable, optional
+        Function that gives the part of the sky's light that arrives at the pixels of some rows [n_row, nx], as
+        :meth:`.LitFraction.on_rows` does; 1 by default.
     threads : int, optional
         Number of threads; all processors by default. No byte depends on it.
     """
@@ -206,30 +214,35 @@ def expose(
     well, gain = exposure.well, exposure.gain
     read = exposure.exposures * exposure.read_noise**2
 
+    beside = 0 if exposure.brighter_fatter is None else _BESIDE
+
     def fill(band: int) -> None:
         rows = slice(band * _ROWS, (band + 1) * _ROWS)
-        collected = _collected(scene, rows, exposure)
+        first = max(rows.start - beside, 0)
+        wide, inner = slice(first, rows.stop + beside), slice(rows.start - first, rows.stop - first)
+        background = exposure.background_of(1.0 if lit_fraction is None else lit_fraction(wide))
+        collected = _collected(scene[wide].astype(np.float64) + background, exposure)[inner]
         variance[rows] = (np.maximum(collected, 0.0) + read) / gain**2
         if exposure.noise:
             random = stream(seed, "image noise", *key, band)
             collected = random.poisson(np.maximum(collected, 0.0)).astype(np.float64)
             collected += random.normal(0.0, np.sqrt(read), collected.shape)
         mask[rows][collected >= well] |= SATURATED
-        image[rows] = (np.minimum(collected, well) - exposure.subtracted) / gain
+        collected = np.minimum(collected, well)
+        if exposure.subtract_background:
+            collected -= background[inner] if isinstance(background, np.ndarray) else background
+        image[rows] = collected / gain
 
-    with ThreadPoolExecutor(thread_count(threads)) as pool:
+    with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
         list(pool.map(fill, range(-(-scene.shape[0] // _ROWS))))
     return ExposedImage(image, variance, mask)
 
 
-def _collected(scene: np.ndarray, rows: slice, exposure: Exposure) -> np.ndarray:
-    """Return the expected charge of sources and background in some rows of a scene, [n_row, nx]."""
+def _collected(light: np.ndarray, exposure: Exposure) -> np.ndarray:
+    """Return the expected charge of light [electron] in the pixels of rows, [n_row, nx]."""
     if exposure.brighter_fatter is None:
-        return scene[rows].astype(np.float64) + exposure.background
-    first = max(rows.start - _BESIDE, 0)
-    light = scene[first : rows.stop + _BESIDE].astype(np.float64) + exposure.background
+        return light
     # Boundaries move anew in each snap, by no more charge than a pixel holds.
     light = with_rim(light[None])
     charge = np.minimum(light / exposure.exposures, exposure.full_well) / exposure.snaps
-    collected = without_rim(collect(light, *boundary_shifts(0.5 * charge, exposure.brighter_fatter)))[0]
-    return np.asarray(collected[rows.start - first : rows.stop - first])
+    return np.asarray(without_rim(collect(light, *boundary_shifts(0.5 * charge, exposure.brighter_fatter)))[0])

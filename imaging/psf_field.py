@@ -21,8 +21,8 @@ from ..pipeline.simulate.ccd_exposure import NoiseFreeStars, expose_positions, h
 from ..pipeline.simulate.photometry import effective_fwhm
 from ..reconstruction.psf_model.interpolation import Interpolation
 from ..reconstruction.psf_model.model import PsfModel
-from ..reconstruction.psf_model.polynomial import design_matrix
 from ..reconstruction.psf_model.recipe import InterpolationKey, Recipe
+from .lit_fraction import LitFraction
 
 #: Pixels around a CCD that the PSF is extrapolated to, for galaxies whose light reaches the CCD.
 RIM = 40
@@ -46,8 +46,7 @@ class PsfField:
 
     model: PsfModel  #: its positions are pixels of the CCD
     pixels: np.ndarray  #: along x and y of the CCD, [2]
-    lit: np.ndarray  #: coefficients of the polynomial of the lit fraction
-    lit_order: int  #: its order
+    light: LitFraction  #: that arrives at the pixels
     cells: int = 1  #: of the stamps of the model along a side of a pixel
 
     @classmethod
@@ -108,8 +107,7 @@ class PsfField:
             model = fitted("kriging")
         share = 1.0 if lit_fraction is None else lit_fraction
         light = for_each(pure_numbers(share, "lit_fraction"), len(places), "lit_fraction")
-        terms = design_matrix(places, extent, order)
-        return cls(model, size, np.linalg.lstsq(terms, light, rcond=None)[0], order, cells)
+        return cls(model, size, LitFraction.fit(places, light, extent, order), cells)
 
     @classmethod
     @check_arguments
@@ -185,8 +183,7 @@ class PsfField:
     @check_arguments
     def lit_fraction(self, positions: ArrayLike) -> np.ndarray:
         """Return the part of the entrance pupil whose light arrives, shape [n]."""
-        terms = design_matrix(self._on_ccd(positions), self.model.extent, self.lit_order)
-        return np.clip((terms * self.lit).sum(axis=1), 0.0, 1.0)
+        return self.light.at(self._on_ccd(positions))
 
     @check_arguments
     def transforms(self, size: int, amplitudes: np.ndarray | None = None) -> np.ndarray:

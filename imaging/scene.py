@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from ..reconstruction.psf_model.recipe import InterpolationKey
 from .draw import SIZES, DrawingWay, SkyPixels, Sources, Window, add_stamps, draw_galaxies
 from .exposure import Exposure, expose
 from .image_file import CcdImage
+from .lit_fraction import LitFraction
 from .psf_field import PsfField, to_pixel
 from .wcs import CcdWcs, ccd_wcs
 
@@ -55,8 +57,14 @@ class CcdScene:
     telescope: str
     seed: int
     epoch: int
+    light: LitFraction  #: that arrives at the pixels, over that on the axis
     cards: tuple[Card, ...] = ()  #: of instrument and time
-    lit_fraction: float = 1.0  #: of the pupil in the middle, over that on the axis
+
+    @property
+    def lit_fraction(self) -> float:
+        """Light that arrives in the middle, over that on the axis."""
+        window = self.window
+        return float(self.light.at(np.array([[window.x, window.y]]) + 0.5 * (np.array(window.shape[::-1]) - 1.0))[0])
 
     @check_arguments
     def exposed(self, exposure: Exposure | None = None, *, threads: int | None = None) -> CcdImage:
@@ -64,9 +72,14 @@ class CcdScene:
         settings = self.exposure if exposure is None else exposure
         ratio = float(settings.electrons(0.0) / self.exposure.electrons(0.0))
         scene = self.electrons if ratio == 1.0 else (self.electrons * ratio).astype(np.float32)
-        ccd_image = expose(scene, settings, self.seed, self.name, self.epoch, threads=threads)
+        on_rows = partial(self.light.on_rows, (self.window.x, self.window.y), self.window.shape)
+        random_key = self.seed, self.name, self.epoch
+        ccd_image = expose(scene, settings, *random_key, lit_fraction=on_rows, threads=threads)
         header = self.wcs.to_header((self.window.x, self.window.y))
-        zero_point = settings.zero_point + 2.5 * math.log10(self.lit_fraction)
+        # Where no light is in the middle, the zero point is that of the axis.
+        lit = self.lit_fraction or 1.0
+        zero_point = settings.zero_point + 2.5 * math.log10(lit)
+        sky = float(settings.background_of(lit)) / settings.gain
         for key, value, comment in (
             ("BUNIT", "adu", ""),
             ("TELESCOP", card_text(self.telescope), "prescription"),
@@ -75,10 +88,10 @@ class CcdScene:
             ("NEXP", settings.exposures, "number of exposures"),
             ("GAIN", settings.gain, "[electron/adu]"),
             ("ZEROPNT", round(zero_point, 6), "[mag] AB, of 1 adu in EXPTIME, in the middle"),
-            ("SKY", round(settings.background / settings.gain, 6), "[adu] background: sky and dark current"),
+            ("SKY", round(sky, 6), "[adu] sky and dark current in the middle"),
             ("SKYSUB", settings.subtract_background, "whether the background is subtracted"),
             ("RDNOISE", settings.read_noise, "[electron] rms of one exposure"),
-            ("SATURATE", settings.saturation_level, "[adu] value of saturated pixels"),
+            ("SATURATE", settings.saturation_level, "[adu] least value of saturated pixels"),
             ("NOISE", settings.noise, "whether there is noise"),
             ("SEED", self.seed, "seed of all random numbers"),
             ("EPOCH", self.epoch, "number of the visit"),
@@ -187,7 +200,6 @@ def draw_ccd(
         progress=progress,
     )
     stars = _add_stars(image, experiment, ccd, psf, exposure, area, threads, progress)
-    middle = np.array([[area.x, area.y]]) + 0.5 * (np.array([area.width, area.height]) - 1.0)
     tables = [
         {
             "PIXEL": stars["PIXEL"],
@@ -217,9 +229,8 @@ def draw_ccd(
         experiment.telescope.name,
         config.seed,
         config.atmosphere.epoch,
+        psf.light,
         tuple(observation_cards(experiment, ccd, exposure.total_time)),
-        # Where no light is in the middle, the zero point is that of the axis.
-        lit_fraction=float(psf.lit_fraction(middle)[0]) or 1.0,
     )
 
 

@@ -23,7 +23,7 @@ from ..experiment import Experiment
 from ..resolved_values import least_star_count, noise_free_components
 from .ccd_exposure import CcdExposure, ccd_stars
 from .ccd_observation import CollectedStars, Observation, collected_images, observe_ccds
-from .photometry import effective_fwhm, signal_to_noise
+from .photometry import effective_fwhm, light_of_sky, signal_to_noise, vignetted
 from .sky_axes import sky_jacobians
 from .star_field import StarField
 
@@ -167,12 +167,14 @@ def _exposed(experiment: Experiment, exposure: CcdExposure) -> _ExposedCcd:
     # Positions do not depend on the magnitude limits, which follow from the vignetting of the stars.
     width = effective_fwhm(holdout.image, holdout.pixel_scale)
     least_light = float(observed.lit_fraction.min()) if len(observed.lit_fraction) else 1.0
+    sky_light = light_of_sky(observed.lit_fraction)
     stars = ccd_stars(experiment, exposure.name, width, least_light=least_light)
     electrons = stars.electrons * observed.lit_fraction
     dimmed = stars.magnitude - 2.5 * np.log10(observed.lit_fraction)
-    snr = signal_to_noise(dimmed, stars.band, experiment.config.atmosphere.exposure_s, width)
-    images = collected_images(experiment, observed.image, observed.pixel_scale, electrons)
-    return _ExposedCcd(exposure, stars, snr, CollectedStars(exposure.name, images, observed.pixel_scale, electrons))
+    band, scale = vignetted(stars.band, sky_light), observed.pixel_scale
+    snr = signal_to_noise(dimmed, band, experiment.config.atmosphere.exposure_s, width)
+    images = collected_images(experiment, observed.image, scale, electrons, sky_light)
+    return _ExposedCcd(exposure, stars, snr, CollectedStars(exposure.name, images, scale, electrons, sky_light))
 
 
 def _modelled(experiment: Experiment, ccds: Sequence[_ExposedCcd], *, noisy: bool) -> list[_ModelledCcd | PachonError]:

@@ -39,13 +39,12 @@ class CollectedStars(NamedTuple):
     images: np.ndarray  #: of unit sum, at their sub-pixel positions, [n, ny, nx]
     pixel_scale: float  #: [rad]
     electrons: np.ndarray  #: [n]
+    lit_fraction: float = 1.0  #: part of the sky's light that arrives
 
 
-def observe_ccd(
-    experiment: Experiment, name: str, images: np.ndarray, pixel_scale: float, electrons: np.ndarray, *, noisy: bool
-) -> Observation:
+def observe_ccd(experiment: Experiment, stars: CollectedStars, *, noisy: bool) -> Observation:
     """Observe the stars of a CCD as :func:`observe_ccds` does."""
-    observation = observe_ccds(experiment, [CollectedStars(name, images, pixel_scale, electrons)], noisy=noisy)[0]
+    observation = observe_ccds(experiment, [stars], noisy=noisy)[0]
     if isinstance(observation, PachonError):
         raise observation
     return observation
@@ -60,9 +59,12 @@ def observe_ccds(
     changes a byte of another: together they cost less, as stars are centred and measured at once.
     """
     config, pixel_scale = experiment.config, ccds[0].pixel_scale
-    sky = sky_electrons_per_pixel(experiment.band, config.atmosphere.exposure_s, pixel_scale)
+    full_sky = sky_electrons_per_pixel(experiment.band, config.atmosphere.exposure_s, pixel_scale)
+    skies = [full_sky * ccd.lit_fraction for ccd in ccds]
     noise = instrument_noise(experiment.band, config.atmosphere.exposure_s)
-    exposed = [attempt(_exposed, experiment, ccd, sky, noise, noisy=noisy) for ccd in ccds]
+    exposed = [
+        attempt(_exposed, experiment, ccd, sky, noise, noisy=noisy) for ccd, sky in zip(ccds, skies, strict=True)
+    ]
     groups = [stars[0] for stars in exposed if not isinstance(stars, PachonError)]
     if not groups:
         return [stars for stars in exposed if isinstance(stars, PachonError)]
@@ -73,7 +75,7 @@ def observe_ccds(
     shapes = measure_shapes(stamps, pixel_scale, experiment.weight_fwhm)
     parts = iter(slices_of(groups))
 
-    def observed(part: slice, images: np.ndarray, full_well: float | None) -> Observation:
+    def observed(part: slice, sky: float, images: np.ndarray, full_well: float | None) -> Observation:
         """Select the stars of a CCD."""
         own, defects = rows_of(shapes, part), np.zeros(len(images), dtype=np.int32)
         if noisy and config.reconstruction.flag_stars:
@@ -86,7 +88,10 @@ def observe_ccds(
         used = own.usable & np.isfinite(stamps[part]).all(axis=(1, 2)) & (defects == 0)
         return Observation((sky, noise), stamps[part], own, defects, used)
 
-    return [stars if isinstance(stars, PachonError) else attempt(observed, next(parts), *stars) for stars in exposed]
+    return [
+        stars if isinstance(stars, PachonError) else attempt(observed, next(parts), sky, *stars)
+        for stars, sky in zip(exposed, skies, strict=True)
+    ]
 
 
 def _exposed(
@@ -101,13 +106,16 @@ def _exposed(
 
 
 def collected_images(
-    experiment: Experiment, images: np.ndarray, pixel_scale: float, electrons: np.ndarray
+    experiment: Experiment, images: np.ndarray, pixel_scale: float, electrons: np.ndarray, lit_fraction: float = 1.0
 ) -> np.ndarray:
-    """Return images of stars of given electrons as the CCD collects them: under the brighter-fatter effect, if on."""
+    """Return images of stars of given electrons as the CCD collects them: under the brighter-fatter effect, if on.
+
+    A part of the light of the sky on the axis arrives, of which pixels have charge too.
+    """
     config = experiment.config
     if config.sensor.brighter_fatter is None:
         return images
-    sky = sky_electrons_per_pixel(experiment.band, config.atmosphere.exposure_s, pixel_scale)
+    sky = lit_fraction * sky_electrons_per_pixel(experiment.band, config.atmosphere.exposure_s, pixel_scale)
     # Columns of the CCD, along which charge is transferred, run along x of the stamps where pixels exchange x and y.
     along_pixels = images.swapaxes(1, 2) if experiment.camera.transposed else images
     # The charge of each snap moves boundaries.

@@ -13,6 +13,7 @@ sky of the band. A value that is not positive and finite raises
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,8 @@ PROVISIONAL_FWHM = 0.6 * ARCSEC
 """Effective FWHM of stars [rad] for magnitude limits before any star is drawn."""
 # Noise-equivalent pixels of a Gaussian whose FWHM is one pixel (SMTN-002).
 _PIXELS_PER_SQUARE_FWHM = 2.266
+# Least part of the sky's light that arrives.
+_LEAST_LIGHT = 1e-3
 
 
 def band_named(band: str | Band) -> Band:
@@ -68,6 +71,19 @@ def sky_electrons_per_pixel(
     area = (_pixel_side(band, pixel_scale) / ARCSEC) ** 2
     brightness = band.dark_sky if sky is None else float(sky)
     return float(exposure * area * 10.0 ** (0.4 * (band.zero_point + band.extinction - brightness)))
+
+
+def light_of_sky(lit_fraction: np.ndarray) -> float:
+    """Return the part of the sky's light that arrives at stars [n], in their mean; 1 without stars.
+
+    It is one to a thousandth, so that the noise of stars without vignetting is that on the axis.
+    """
+    return max(round(float(np.mean(lit_fraction)), 3), _LEAST_LIGHT) if len(lit_fraction) else 1.0
+
+
+def vignetted(band: Band, light: float) -> Band:
+    """Return a band with the sky of a part of the field where so much of the light on the axis arrives."""
+    return replace(band, dark_sky=band.dark_sky - 2.5 * float(np.log10(light)))
 
 
 def instrument_noise(band: str | Band, exposure: float) -> float:

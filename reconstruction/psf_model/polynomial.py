@@ -46,8 +46,12 @@ def design_matrix(positions: Any, extent: Extent, order: int) -> np.ndarray:
     if not 0 <= order <= MOST_ORDER:
         raise ConfigError(f"order = {order}: expected a polynomial order from 0 to {MOST_ORDER}")
     along_u, along_v = (np.polynomial.legendre.legvander(t, order) for t in mapped(positions, extent).T)
-    columns = [along_u[:, total - m] * along_v[:, m] for total in range(order + 1) for m in range(total + 1)]
-    return np.stack(columns, axis=1)
+    return np.stack([along_u[:, i] * along_v[:, j] for i, j in degrees(order)], axis=1)
+
+
+def degrees(order: int) -> list[tuple[int, int]]:
+    """Return the degrees (l, m) of the terms of :func:`design_matrix`, in their order."""
+    return [(total - m, m) for total in range(order + 1) for m in range(total + 1)]
 
 
 def mapped(positions: Any, extent: Extent) -> np.ndarray:

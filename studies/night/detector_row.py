@@ -103,9 +103,9 @@ def moments_along_pixels(
 
 
 def noise_columns(experiment: Experiment, lit_fraction: float) -> dict[str, float]:
-    """Return sky, noise, zero point and inverse variance of a pixel; `lit_fraction` is that of the CCD's middle."""
+    """Return sky, noise, zero point and inverse variance of a pixel in a CCD's middle, where light is vignetted."""
     band, seconds = experiment.band, experiment.config.atmosphere.exposure_s
-    sky = sky_electrons_per_pixel(band, seconds)
+    sky = lit_fraction * sky_electrons_per_pixel(band, seconds)
     variance = sky + instrument_noise(band, seconds) ** 2
     zero_point = band.zero_point + 2.5 * math.log10(seconds * lit_fraction / band.gain)
     nanojansky = 10.0 ** (0.4 * (NANOJANSKY - zero_point))  # of 1 adu

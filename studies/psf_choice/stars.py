@@ -17,13 +17,15 @@ from ...measure.stamps import observe_stamps
 from ...pipeline.experiment import Experiment
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import one_by_one, simulate_ccds
-from ...pipeline.simulate.ccd_observation import Observation, collected_images, observe_ccd
+from ...pipeline.simulate.ccd_observation import CollectedStars, Observation, collected_images, observe_ccd
 from ...pipeline.simulate.photometry import (
     effective_fwhm,
     instrument_noise,
+    light_of_sky,
     limiting_magnitude,
     signal_to_noise,
     sky_electrons_per_pixel,
+    vignetted,
 )
 from ...pipeline.simulate.star_field import Depth, make_star_field
 from ...reconstruction.psf_model.model import CLIPPING, PsfModel
@@ -85,7 +87,9 @@ def simulate(experiment: Experiment, threads: int | None, reporter: Reporter) ->
 def _centered_and_measured(experiment: Experiment, exposure: CcdExposure, images: np.ndarray) -> Observation:
     """Centre and measure images of the stars of a CCD, noise included."""
     scale = exposure.observed.pixel_scale
-    return observe_ccd(experiment, exposure.name, images, scale, exposure.positions.electrons, noisy=False)
+    return observe_ccd(
+        experiment, CollectedStars(exposure.name, images, scale, exposure.positions.electrons), noisy=False
+    )
 
 
 def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int) -> ObservedCcd:
@@ -101,17 +105,20 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
         return ObservedCcd(ccd.noise_free, ccd.noise_free_moments, unlimited, unlimited, nothing, nothing)
     seed, light = experiment.config.seed, exposed.lit_fraction
     width = effective_fwhm(ccd.exposure.holdout.image, ccd.exposure.holdout.pixel_scale)
-    faint = limiting_magnitude(snr_min, places.band, places.exposure, width) + 2.5 * np.log10(light.min())
+    sky_light = light_of_sky(light)
+    at_rim = vignetted(places.band, light_of_sky(light[[light.argmin()]]))
+    faint = limiting_magnitude(snr_min, at_rim, places.exposure, width) + 2.5 * np.log10(light.min())
     # The same stars in the same order; the limit alone changes.
     depth = Depth(places.band, places.exposure, faint=faint)
     stars = make_star_field(places.ccd, 0, n_stars, seed, fwhm=width, depth=depth)
-    sky = sky_electrons_per_pixel(places.band, places.exposure, exposed.pixel_scale)
+    band = vignetted(places.band, sky_light)
+    sky = sky_electrons_per_pixel(band, places.exposure, exposed.pixel_scale)
     rng = stream(seed, "study", "noise", name, draw)
     electrons = stars.electrons * light
-    collected = collected_images(experiment, exposed.image, exposed.pixel_scale, electrons)
+    collected = collected_images(experiment, exposed.image, exposed.pixel_scale, electrons, sky_light)
     images = observe_stamps(collected, electrons, sky, instrument_noise(places.band, places.exposure), rng)
     observation = _centered_and_measured(experiment, ccd.exposure, images)
-    snr = signal_to_noise(stars.magnitude - 2.5 * np.log10(light), places.band, places.exposure, width)
+    snr = signal_to_noise(stars.magnitude - 2.5 * np.log10(light), band, places.exposure, width)
     moments, noise_free = star_moments(observation.images, exposed.pixel_scale), ccd.noise_free_moments
     # The noise of e and of g is proportional to 1/(S/N); the factor is that of all stars together.
     noise = np.stack(

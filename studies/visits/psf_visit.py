@@ -20,13 +20,15 @@ from ...pipeline.resolved_values import resolved_value
 from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_outline
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import fit_ccd_models, model_stars
-from ...pipeline.simulate.ccd_observation import Observation, collected_images, observe_ccd
+from ...pipeline.simulate.ccd_observation import CollectedStars, Observation, collected_images, observe_ccd
 from ...pipeline.simulate.photometry import (
     effective_fwhm,
     electrons,
+    light_of_sky,
     limiting_magnitude,
     saturation_magnitude,
     signal_to_noise,
+    vignetted,
 )
 from ...pipeline.simulate.screen_cover import check_screens
 from ...pipeline.simulate.star_field import StarField, magnitudes_at
@@ -172,15 +174,17 @@ def visit_psfs(
         """Return a CCD without its model, and the stars of this where it has one of its own."""
         stars, observed_psfs = exposure.positions, exposure.observed
         counts = stars.electrons * observed_psfs.lit_fraction
-        images = collected_images(experiment, observed_psfs.image, observed_psfs.pixel_scale, counts)
-        observation = observe_ccd(experiment, exposure.name, images, observed_psfs.pixel_scale, counts, noisy=True)
+        scale, sky_light = observed_psfs.pixel_scale, light_of_sky(observed_psfs.lit_fraction)
+        images = collected_images(experiment, observed_psfs.image, scale, counts, sky_light)
+        collected = CollectedStars(exposure.name, images, scale, counts, sky_light)
+        observation = observe_ccd(experiment, collected, noisy=True)
         true = np.concatenate([exposure.holdout.image, resolved_value(exposure.centered).image])
         result = _CcdResult(exposure, observation, counts, true, None)
         if together:
             return result, None
-        width = effective_fwhm(true, observed_psfs.pixel_scale)
+        width = effective_fwhm(true, scale)
         dimmed = stars.magnitude - 2.5 * np.log10(observed_psfs.lit_fraction)
-        snr = signal_to_noise(dimmed, stars.band, config.atmosphere.exposure_s, width)
+        snr = signal_to_noise(dimmed, vignetted(stars.band, sky_light), config.atmosphere.exposure_s, width)
         return result, model_stars(experiment, observation, stars, counts, snr)
 
     def modelled(exposures: Sequence[CcdExposure]) -> list[_CcdResult | PachonError]:

@@ -1,12 +1,14 @@
 """Noise, saturation and levels of exposures against their statistics, and the formulas of SMTN-002."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from pachon.core.errors import ConfigError, DomainError
 from pachon.imaging.exposure import SATURATED, Exposure, expose
+from pachon.imaging.lit_fraction import LitFraction
 from pachon.pipeline.config import Configuration, ListedVisitConfig
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.sensor.brighter_fatter import brighter_fatter
@@ -45,6 +47,27 @@ def test_without_noise_an_image_is_the_expected_one():
     subtracted = expose(SCENE, Exposure(noise=False), 1, "A")
     assert subtracted.image == pytest.approx(250.0, rel=1e-6)
     assert (subtracted.variance == kept.variance).all()
+
+
+def test_vignetting_dims_the_sky_and_not_the_dark_current():
+    positions = np.random.default_rng(1).uniform(0.0, 400.0, (60, 2))
+    expected = np.clip(0.7 - 1e-3 * positions[:, 0] + 2e-6 * positions[:, 0] * positions[:, 1], 0.0, 1.0)
+    light = LitFraction.fit(positions, expected, (-0.5, 399.5, -0.5, 399.5), 2)
+    np.testing.assert_allclose(light.at(positions), expected, atol=1e-12)
+    # A part of the CCD from the pixel (40, 90).
+    on_rows = partial(light.on_rows, (40, 90), SCENE.shape)
+    settings = Exposure(noise=False, subtract_background=False)
+    found = expose(SCENE, settings, 1, "A", lit_fraction=on_rows)
+    dark = 15.0 * 0.2
+    y, x = np.indices(SCENE.shape)
+    lit = light.at(np.stack([x.ravel() + 40, y.ravel() + 90], axis=1)).reshape(SCENE.shape)
+    assert np.ptp(lit) > 0.3
+    np.testing.assert_allclose(found.image, 250.0 + dark + lit * (BACKGROUND - dark), rtol=1e-6)
+    np.testing.assert_allclose(found.variance, found.image + 8.8**2, rtol=1e-6)
+    subtracted = expose(SCENE, Exposure(noise=False), 1, "A", lit_fraction=on_rows)
+    assert subtracted.image == pytest.approx(250.0, rel=1e-6)
+    one, four = (expose(SCENE, settings, 1, "A", lit_fraction=on_rows, threads=n).image for n in (1, 4))
+    assert (one == four).all()
 
 
 def test_the_sky_of_the_configuration_sets_the_background():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -115,7 +116,8 @@ def visit_image(
         light = (exposure.electrons(magnitude) * stars.lit_fraction).astype(np.float32)
         corners = nearest.astype(np.int64) - stars.image.shape[1] // 2 - (window.x, window.y)
         add_stamps(scene, stars.image * light[:, None, None], corners)
-    exposed = expose(scene, exposure, config.seed, name, visit.epoch, threads=threads)
+    on_rows = partial(field.light.on_rows, (window.x, window.y), window.shape)
+    exposed = expose(scene, exposure, config.seed, name, visit.epoch, lit_fraction=on_rows, threads=threads)
     exposed.mask[_rim_mask(window, pixels)] |= EDGE
     return exposed
 

@@ -59,7 +59,8 @@ def test_photometry_of_a_visit(experiment):
     columns = detector_row.noise_columns(experiment, 0.98)
     zero_point = 28.36 - 0.13 * (airmass - 1) + 2.5 * math.log10(30 * 0.98)
     assert columns["zeroPoint"] == pytest.approx(zero_point)
-    sky = 30 * 0.04 * 10 ** (0.4 * (28.36 + 0.13 - 20.7))
+    # Vignetting dims the sky as it does stars.
+    sky = 0.98 * 30 * 0.04 * 10 ** (0.4 * (28.36 + 0.13 - 20.7))
     assert columns["skyBg"] == pytest.approx(sky)
     variance = sky + 2 * 8.8**2 + 0.2 * 30
     assert columns["skyNoise"] == pytest.approx(math.sqrt(variance))
