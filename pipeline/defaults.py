@@ -28,12 +28,13 @@ from ..models.site import Site
 from ..models.telescope import Telescope
 from ..raytrace.ideal_lens import require_image
 from ..reconstruction.psf_model.basis import COMPONENTS
+from ..sky.visit_list.seeing import seeing_width
 from ..wavefront.psf.engines import ENGINES
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL, FastEngine
 from ..wavefront.psf.long_exposure import LongExposureEngine
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .alignment_states import with_active_optics_state
-from .config import BandName, Configuration, PsfConfig, ReconstructionConfig
+from .config import AtmosphereConfig, BandName, Configuration, PsfConfig, ReconstructionConfig
 from .config_checks import WEIGHT_PIXELS, check_combinations
 from .photometry import airmass_of, band_of, pixel_angle, resolved_photometry
 from .resolved_values import resolved_value
@@ -59,6 +60,10 @@ _WEIGHT = 0.7
 _WEIGHT_ALONE = 0.3
 # Side of a stamp with an atmosphere [arcsec], 31 pixels of the LSST.
 _SIDE = 6.2
+# Least side in widths of the seeing: half of it makes rms widths 1 % too large, this 0.1 %.
+_SEEINGS = 5.0
+# Largest side of a stamp in wide seeing, over that above.
+_LARGEST = 3.0
 # Side of a stamp without an atmosphere [arcsec], 61 fine pixels.
 _SIDE_ALONE = 3.05
 # Fewest pixels on a side of a stamp.
@@ -115,6 +120,10 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     with error_context(key=None if atmosphere.site is None else "atmosphere.site"):
         site = load_site(site_name)
     site = _with_ground_wind(site, atmosphere.ground_wind_m_s)
+    atmosphere = _with_defaults(
+        atmosphere.model_copy(update={"site": site_name}),
+        {"r0_m": float(site.r0), "outer_scale_m": float(site.outer_scale)},
+    )
     stars, light = config.stars, resolved_photometry(config.photometry, telescope, camera, band, ends)
     if stars.catalogue is not None:
         width, seconds, measured = PROVISIONAL_FWHM, atmosphere.exposure_s, band_of(band, light, airmass_of(atmosphere))
@@ -131,7 +140,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     psf = _with_defaults(
         config.psf,
         (_WITH_ATMOSPHERE | _pupil_points(config.psf, telescope) if atmosphere.enabled else _OPTICS_ALONE)
-        | _stamp_geometry(config, telescope, camera),
+        | _stamp_geometry(config.psf.stamp, atmosphere, telescope, camera),
     )
     resolved = config.model_copy(
         update={
@@ -144,10 +153,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
             "stars": stars,
             "focal_plane": plane,
             "active_optics": active,
-            "atmosphere": _with_defaults(
-                atmosphere.model_copy(update={"site": site_name}),
-                {"r0_m": float(site.r0), "outer_scale_m": float(site.outer_scale)},
-            ),
+            "atmosphere": atmosphere,
             "psf": psf,
             "reconstruction": _reconstruction(
                 config.reconstruction, _moment_weight(atmosphere.enabled, psf, telescope)
@@ -226,13 +232,20 @@ def _camera_of(telescope: Telescope, name: str | None) -> Camera:
         return load_camera(camera_name)
 
 
-def _stamp_geometry(config: Configuration, telescope: Telescope, camera: Camera) -> dict[str, float]:
-    """Return the default pixels [um] and size of stamps, as large on the sky as those of the LSST."""
-    side, fine = (_SIDE, 1) if config.atmosphere.enabled else (_SIDE_ALONE, _FINE)
+def _stamp_geometry(stamp: int | None, air: AtmosphereConfig, telescope: Telescope, camera: Camera) -> dict[str, float]:
+    """Return the default pixels [um] and, where it is open, size of stamps: as on the sky as those of the LSST.
+
+    Those of wide PSFs are larger: light beyond the rim wraps around.
+    """
+    side, fine = (_SIDE * ARCSEC, 1) if air.enabled else (_SIDE_ALONE * ARCSEC, _FINE)
     pixel = camera.pixel_size / fine
     geometry: dict[str, float] = {"pixel_um": round(pixel * 1e6, 9)}
-    if config.psf.stamp is None:
-        pixels = side * ARCSEC / pixel_angle(telescope, pixel)
+    if stamp is None:
+        if air.enabled:
+            r0, outer_scale = (np.array(resolved_value(value)) for value in (air.r0_m, air.outer_scale_m))
+            seeing = float(seeing_width(r0, outer_scale)) * airmass_of(air) ** 0.6
+            side = min(max(side, _SEEINGS * seeing), _LARGEST * side)
+        pixels = side / pixel_angle(telescope, pixel)
         geometry["stamp"] = max(2 * round(0.5 * (pixels - 1.0)) + 1, _FEWEST)
     return geometry
 

@@ -25,11 +25,11 @@ def stamp_side(pixels: int, pixel_scale: float) -> int:
 
 
 def with_stamps(experiment: Experiment, run: Configuration, pixels: int) -> Experiment:
-    """Return an experiment whose stamps have so many pixels, or on finer ones the angle of those of the LSST.
+    """Return an experiment whose stamps have so many pixels or more, and on finer ones the angle of those of the LSST.
 
     The experiment itself where the configuration of the run has a stamp.
     """
     if run.psf.stamp is not None:
         return experiment
-    side = stamp_side(pixels, experiment.band.pixel_scale)
+    side = max(stamp_side(pixels, experiment.band.pixel_scale), experiment.stamp_size)
     return replace(experiment, config=with_options(experiment.config, psf__stamp=side))

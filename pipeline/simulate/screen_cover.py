@@ -70,7 +70,8 @@ def check_screens(config: Configuration, telescope: Telescope, camera: Camera, s
     raise ConfigError(
         f"atmosphere.exposure_s = {air.exposure_s:g}: the light to the chosen CCDs crosses {least} m of the layer at"
         f" {site.altitudes[layer]:g} m, whose periodic screen comes round after {air.screen_length_m:g} m: expected"
-        f" atmosphere.screen_length_m of at least {least} (and atmosphere.screen_size = {size} to keep its pixel)"
+        f" atmosphere.screen_length_m of at least {least} (and atmosphere.screen_size = {size} to keep its pixel), or"
+        " psf.engine = statistical, which has no screens"
     )
 
 
