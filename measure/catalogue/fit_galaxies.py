@@ -84,7 +84,7 @@ def fit_galaxies(
         [ny, nx], 0 for sky, otherwise the number of an object: pixels of objects other than the one at (x, y) are
         ignored.
     solver : LevenbergMarquardt, optional
-        When a fit ends; 30 models at most, a change of 1e-5, by default.
+        When a fit ends, and its errors; 30 models at most, a change of 1e-5, whole errors by default.
     threads : int, optional
         All processors by default.
 
@@ -251,7 +251,7 @@ def _fit_stamps(
     # Steps are solved by LAPACK, whose result must not depend on its threads.
     with one_blas_thread():
         minimum = solver.minimize(fitter, start, bounds)
-        covariance = _fisher_inverse(minimum.equations.matrix)
+        covariance = solver.covariance(fitter, minimum)
     inner = np.s_[:, side // 4 : side - side // 4, side // 4 : side - side // 4]
     n_pixels = (weight > 0.0).sum(axis=(1, 2))
     flags = flags.astype(np.int32)
@@ -292,21 +292,6 @@ def _moment_estimates(data: np.ndarray, weight: np.ndarray, center: np.ndarray, 
     galaxy_variance = np.maximum(np.where(positive, variance, 2.0 * psf_variance) - psf_variance, 0.3 * psf_variance)
     flux = np.where(positive, total, np.abs(light).sum(axis=(1, 2))) * (1.0 + variance / width)
     return np.stack([flux, center[:, 0], center[:, 1], galaxy_variance, np.zeros(len(data)), galaxy_variance], axis=1)
-
-
-def _fisher_inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverses of Fisher matrices [n, 6, 6]; NaN for a singular one."""
-    scale = np.sqrt(np.diagonal(matrix, axis1=1, axis2=2))
-    regular = (scale > 0.0).all(axis=1)
-    scale = np.where(scale > 0.0, scale, 1.0)
-    scaled = matrix / (scale[:, :, None] * scale[:, None, :])
-    # Six parameters of fewer pixels: the smallest eigenvalue is rounding.
-    regular &= np.isfinite(scaled).all(axis=(1, 2))
-    scaled[~regular] = np.eye(matrix.shape[1])
-    regular &= np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
-    result = np.full(matrix.shape, np.nan)
-    result[regular] = np.linalg.inv(scaled[regular]) / (scale[regular, :, None] * scale[regular, None, :])
-    return result
 
 
 def _checked_psfs(psf_images: ArrayLike, psf_index: ArrayLike | None, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -61,7 +61,7 @@ class GalaxyFits(Result):
         Covariance Cxx, Cxy, Cyy of the Gaussian [pixel^2], [n, 3]. Of a point-like galaxy noise makes it negative as
         often as positive.
     covariance : array
-        Of the errors of flux, x, y, Cxx, Cxy, Cyy: the inverse of the Fisher matrix, [n, 6, 6].
+        Of the errors of flux, x, y, Cxx, Cxy, Cyy, [n, 6, 6].
     chi2 : array
         Sum over the pixels of (data - model)^2 / variance, [n].
     pixels : array of int

@@ -15,6 +15,7 @@ import numpy as np
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.units import require_positive
+from .fit_errors import error_covariance, fisher_inverse
 from .gaussian_model import GaussianStamps, NormalEquations
 
 # Damping of the first step (Marquardt 1963, scaled by the diagonal).
@@ -99,6 +100,9 @@ class LevenbergMarquardt:
         Most models computed for a galaxy.
     tolerance : float
         Largest change of the model by the last step, relative to the data, as the root of the weighted sum of squares.
+    whole_errors : bool
+        Whether errors are those of the whole curvature of chi-square, of three more models; else of the Fisher matrix,
+        by which the variance of e of exponential discs is 1.1 to 1.4 times too small.
 
     Raises
     ------
@@ -108,6 +112,7 @@ class LevenbergMarquardt:
 
     max_evaluations: int = 30
     tolerance: float = 1e-5
+    whole_errors: bool = True
 
     def __post_init__(self) -> None:
         if self.max_evaluations < 1:
@@ -154,6 +159,12 @@ class LevenbergMarquardt:
             converged[active] = done
             active = active[~done & (damping[active] < _MOST_DAMPING)]
         return Minimum(params, NormalEquations(chi2, right, matrix), converged, at_bounds, evaluations)
+
+    def covariance(self, stamps: GaussianStamps, minimum: Minimum) -> np.ndarray:
+        """Return the covariances of the errors of minima [n, 6, 6]; NaN for a singular one."""
+        if self.whole_errors:
+            return error_covariance(stamps, minimum.params, minimum.equations)
+        return fisher_inverse(minimum.equations.matrix)
 
 
 def _scalar_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:

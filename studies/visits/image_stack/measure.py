@@ -28,7 +28,7 @@ from ....measure.shapes import half_light_radii, measure_shapes
 from ....measure.shear.detection import detect_shear
 from ....measure.shear.noise import CorrelatedNoise
 from ....measure.shear.weight import weight_sigma
-from ..galaxy_shapes import SHEAR_MIN_SNR, GalaxyShapes, measure_galaxies
+from ..galaxy_shapes import SHEAR_MIN_SNR, SOLVER, GalaxyShapes, measure_galaxies
 from ..null_result import NullTest, null_metrics
 from ..null_test import FAINTEST_SNR, REACH, write_pictures, write_shapes
 from ..psf_visit import stack_limit
@@ -212,6 +212,7 @@ def measure_tile(
             half_light_radius=objects.half_light_radius[rows],
             mask=image.mask,
             segmentation=objects.segmentation,
+            solver=SOLVER,
             threads=threads,
         )
         for psf_images in (psfs.model, psfs.true)
