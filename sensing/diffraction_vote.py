@@ -7,7 +7,7 @@ Chi-square with a = 1 is lower than with a = 0 where :math:`\hat a > 1/2`.
 
 Where much of the seeing of a fit by rays stands for diffracted light, that fit is no start: donuts of a 1.2 m telescope
 of f/2.5 have 1.8 arcsec for 0.6. Neither is it where images are small, nor does an amount between those of rays and of
-waves decide. Then fits of both kinds are compared.
+waves decide, nor a small one where rays leave more than noise, as of caustics. Then fits of both kinds are compared.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ _MUCH = 0.3
 #: Amount of diffracted light from which on it is not that of rays: these leave 0, waves 0.97 to 1.6 in 60 donuts, and
 #: 0.34 where AuxTel has 100 nm in terms up to Z22, whose fit by rays is far off.
 _NOT_OF_RAYS = 0.2
+#: Standard deviations of chi-square from which on rays leave more than noise.
+_DEVIATIONS = 5.0
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,7 @@ class _RimAmplitude:
     value: float
     precision: float
     seeing: float  #: part of the strength of the turbulence that stands for this light in a fit by rays
+    explained: bool  #: whether the fit by rays leaves no more than noise
 
 
 def _rim_amplitude(instrument: Instrument, star: StarSolution) -> _RimAmplitude | None:
@@ -95,7 +98,9 @@ def _rim_amplitude(instrument: Instrument, star: StarSolution) -> _RimAmplitude 
         return None
     amplitude = float(light_column @ residual - cross @ solved[:, 1]) / information
     seeing = float(solved[STRENGTH, 0] / scale[STRENGTH]) / unknowns[STRENGTH]
-    return _RimAmplitude(amplitude, information, seeing)
+    n_pixels = int(stamp.used.sum())
+    explained = float(solution.loss) < n_pixels + _DEVIATIONS * math.sqrt(2.0 * n_pixels)
+    return _RimAmplitude(amplitude, information, seeing, explained)
 
 
 def _has_air(star: StarSolution) -> bool:
@@ -111,7 +116,8 @@ def _waves_fit_better(amplitudes: Sequence[_RimAmplitude]) -> bool | None:
         return True
     linear = np.mean([a.seeing for a in amplitudes]) < _MUCH
     amount = np.average([a.value for a in amplitudes], weights=[a.precision for a in amplitudes])
-    return False if linear and amount < _NOT_OF_RAYS else None
+    explained = all(a.explained for a in amplitudes)
+    return False if linear and explained and amount < _NOT_OF_RAYS else None
 
 
 def _chi2_fall(rays: StarFit, waves: StarFit) -> float:
