@@ -86,6 +86,8 @@ class Telescope(Pictured):
         Aperture, fields, wavelengths and stop as the designer stated them, the defaults of calculations.
     site : str, optional
         Name of the site, or path of its file.
+    dispersion_corrector : str, optional
+        Surface or group that moves across the axis to take out the dispersion by the air.
     pupil_center : tuple of float, shape (2,)
         Centre of the entrance pupil in its plane [m]; off the axis where changes have moved the image of a stop there.
     """
@@ -116,6 +118,7 @@ class Telescope(Pictured):
     object_distance: float = math.inf
     design_data: DesignData = field(default_factory=DesignData)
     site: str | None = None
+    dispersion_corrector: str | None = None
     pupil_center: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -141,6 +144,10 @@ class Telescope(Pictured):
             for member in members:
                 if member not in names:
                     raise PrescriptionError(f"group {group!r}: {unknown_name('surface', member, names)}")
+        corrector = self.dispersion_corrector
+        if corrector is not None and corrector not in (*names, *self.groups):
+            unknown = unknown_name("surface or group", corrector, (*names, *self.groups))
+            raise PrescriptionError(f"dispersion_corrector: {unknown}")
         for key in ("pupil_diameter", "launch_distance", "reference_sphere_radius", "field_radius", "field_limit"):
             if not (np.isfinite(getattr(self, key)) and getattr(self, key) > 0):
                 raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected a positive number")

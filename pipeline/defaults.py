@@ -36,6 +36,7 @@ from .alignment_states import ENDINGS as STATE_ENDINGS
 from .alignment_states import with_active_optics_state
 from .config import AtmosphereConfig, BandName, Configuration, PsfConfig, ReconstructionConfig
 from .config_checks import WEIGHT_PIXELS, check_combinations
+from .dispersion import with_dispersion_corrected
 from .photometry import airmass_of, band_of, pixel_angle, resolved_photometry
 from .resolved_values import resolved_value
 from .simulate.photometry import PROVISIONAL_FWHM, limiting_magnitude, saturation_magnitude
@@ -76,7 +77,7 @@ class ResolvedConfiguration:
     """Configuration without open values, and the models that it names."""
 
     config: Configuration  #: every default filled in, paths absolute
-    telescope: Telescope  #: changes applied, camera rotated
+    telescope: Telescope  #: changes applied, dispersion corrected, camera rotated
     camera: Camera
     site: Site  #: of the atmosphere
 
@@ -162,6 +163,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     )
     telescope = configured_telescope(telescope, resolved)
     check_combinations(resolved, telescope, _pixel_arcsec(resolved.psf, telescope))
+    telescope = with_dispersion_corrected(telescope, resolved, site)
     # Stars may fall anywhere on a CCD: all of it must be within the field.
     corner_fields(telescope, camera, resolved.ccds or ())
     check_screens(resolved, telescope, camera, site)

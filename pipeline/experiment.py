@@ -33,13 +33,13 @@ from ..raytrace.rays import field_direction
 from ..sky.pointing import Pointing
 from ..wavefront.aberration import ResidualWavefront
 from ..wavefront.atmosphere.atmosphere import Atmosphere
-from ..wavefront.atmosphere.refraction import dispersion_shift
 from ..wavefront.atmosphere.screen_sampling import ScreenSampling
 from ..wavefront.chief_rays import chief_rays
 from ..wavefront.psf.engines import ENGINES
 from .config import Configuration, digest
 from .config_hash import hashed_content
 from .defaults import resolve
+from .dispersion import air_dispersion, zenith_direction
 from .photometry import airmass_of, band_of, lit_fraction_on_axis
 from .resolved_values import resolved_value
 from .sensor.displacement import Displacement, EdgeRolloff, TreeRings
@@ -221,26 +221,17 @@ class Experiment:
     @property
     def zenith_direction(self) -> float:
         """Direction of the zenith on the sky, from +x towards +y of the telescope [rad]."""
-        zenith = self.config.atmosphere.zenith_position_angle_deg
-        if zenith is None:
-            return 0.0
-        roll = 0.0 if self.config.pointing is None else self.config.pointing.position_angle_deg
-        return math.radians(90.0 + roll - zenith)
+        return zenith_direction(self.config)
 
     @property
     def dispersion(self) -> np.ndarray | None:
-        """Shift in field angle of each wavelength by the air [rad], shape [n_wave, 2]; None without an atmosphere."""
-        settings = self.config.atmosphere
-        if not settings.enabled:
+        """Shift in field angle of each wavelength by the air [rad], shape [n_wave, 2]; None where there is none.
+
+        An ideal telescope in place of one with a corrector has a perfect one.
+        """
+        if self.atmosphere_only and self.telescope.dispersion_corrector is not None:
             return None
-        middle = float(self.wavelengths[len(self.wavelengths) // 2])
-        return dispersion_shift(
-            self.wavelengths,
-            middle,
-            math.radians(settings.zenith_angle_deg),
-            self.zenith_direction,
-            self.site.weather,
-        )
+        return air_dispersion(self.config, self.site)
 
     @property
     def screen_kinds(self) -> tuple[str, ...]:

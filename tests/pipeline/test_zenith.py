@@ -1,14 +1,19 @@
-"""Position angle of the zenith: from north through east, whatever the roll; the key that it replaces is refused."""
+"""Position angle of the zenith: from north through east, whatever the roll; correctors of the air's dispersion."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import pachon
-from pachon.core.errors import ConfigError
-from pachon.pipeline.config import load_configuration
+from pachon.core.errors import ConfigError, PrescriptionError
+from pachon.pipeline.config import configuration_of, load_configuration
+from pachon.pipeline.dispersion import with_dispersion_corrected
 from pachon.pipeline.experiment import Experiment
+from pachon.raytrace.rays import field_direction
 from pachon.studies.visits.plan import Visit
 from pachon.studies.visits.psf_visit import visit_experiment
+from pachon.wavefront.chief_rays import chief_rays
 
 
 def blue_towards(experiment, roll):
@@ -71,3 +76,29 @@ def test_the_value_means_what_the_old_one_did(low):
     shift = low(100.0, 30.0).dispersion[0]
     # Blue light comes from nearer to the zenith, and its slopes point away from there.
     assert np.rad2deg(np.arctan2(-shift[1], -shift[0])) == pytest.approx(20.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(("band", "blue"), [("g", 0.6), ("r", 0.2)])
+@pytest.mark.parametrize("zenith", [None, 40.0])
+def test_a_dispersion_corrector_brings_the_colours_together(band, blue, zenith):
+    air = {"zenith_angle_deg": 45.0, "zenith_position_angle_deg": zenith}
+    content = {"telescope": "hsc", "band": band, "ccds": ["hsc050"], "atmosphere": air}
+    experiment = Experiment.from_config(configuration_of(content, "run"))
+    arcsec = np.deg2rad(1.0 / 3600.0)
+    assert np.hypot(*np.ptp(experiment.dispersion, axis=0)) > blue * arcsec
+    landed = [
+        chief_rays(experiment.telescope, field_direction(*shift[:, None]), wavelength).position[0, :2]
+        for shift, wavelength in zip(experiment.dispersion, experiment.wavelengths, strict=True)
+    ]
+    # The secondary spectrum of the lenses is left, over 18 m of focal length.
+    assert np.hypot(*np.ptp(landed, axis=0)) < 0.02 * arcsec * 18.3
+    # An ideal telescope in its place has none.
+    assert replace(experiment, atmosphere_only=True).dispersion is None
+
+
+def test_a_corrector_that_disperses_too_little_is_told():
+    telescope = replace(pachon.load_telescope("hsc"), dispersion_corrector="W_entrance")
+    content = {"telescope": "hsc", "ccds": ["hsc050"], "atmosphere": {"zenith_angle_deg": 45.0}}
+    experiment = Experiment.from_config(configuration_of(content, "run"))
+    with pytest.raises(PrescriptionError, match=r"dispersion_corrector = W_entrance: .*expected lenses that disperse"):
+        with_dispersion_corrected(telescope, experiment.config, experiment.site)

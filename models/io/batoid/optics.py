@@ -153,6 +153,7 @@ class Extras(Section):
     wavelengths: WavelengthsSection | None = None
     camera: OptionalNameOrFile = None
     site: OptionalNameOrFile = None
+    dispersion_corrector: OptionalText = None
     groups: dict[str, GroupSection] = Field(default_factory=dict)
     design: DesignSection = DesignSection()
     semi_diameters: dict[str, Length] = Field(default_factory=dict)

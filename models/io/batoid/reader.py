@@ -121,6 +121,7 @@ def _telescope(file: BatoidFile, path: Path) -> Telescope:
         band=waves.band if waves else (max(0.99 * default, low), min(1.01 * default, high)),
         camera=extras.camera,
         site=extras.site,
+        dispersion_corrector=extras.dispersion_corrector,
         medium_before=first_medium,
         groups=members | {name: group.surfaces for name, group in extras.groups.items()},
         design_data=extras.design.data(),

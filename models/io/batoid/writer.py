@@ -140,6 +140,7 @@ def _extras(t: Telescope, groups: list[str]) -> dict[str, Any]:
         "wavelengths": {"range": list(t.wavelength_range), "default": t.default_wavelength, "band": [low, high]},
         "camera": t.camera,
         "site": t.site,
+        "dispersion_corrector": t.dispersion_corrector,
         "groups": {
             name: {"surfaces": list(t.groups[name]), "pivot": list(pivot), "rotation": [list(row) for row in axes]}
             for name, (pivot, axes) in frames.items()

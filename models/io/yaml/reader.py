@@ -231,6 +231,7 @@ class Prescription(Section):
     design: DesignSection = DesignSection()
     camera: OptionalNameOrFile = None
     site: OptionalNameOrFile = None
+    dispersion_corrector: OptionalText = None
     medium_before: OptionalText = None
     media: Annotated[dict[str, AnyMedium], BeforeValidator(_no_vacuum)] = Field(default_factory=dict)
     coatings: dict[str, CoatingSection] = Field(default_factory=dict)
@@ -296,6 +297,7 @@ class Prescription(Section):
             band=self.wavelengths.band,
             camera=self.camera,
             site=self.site,
+            dispersion_corrector=self.dispersion_corrector,
             medium_before=medium_before,
             groups={name: group.surfaces for name, group in self.groups.items()},
             group_frames={name: (g.pivot, g.rotation) for name, g in self.groups.items() if g.pivot is not None},

@@ -75,6 +75,7 @@ def _text(t: Telescope, length_unit: str) -> str:
         "object_distance": Metres(t.object_distance) if math.isfinite(t.object_distance) else None,
         "camera": t.camera,
         "site": t.site,
+        "dispersion_corrector": t.dispersion_corrector,
         "medium_before": names[t.medium_before] if t.medium_before != VACUUM else None,
     }
     lists = {

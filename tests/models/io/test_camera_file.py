@@ -1,6 +1,7 @@
 """Camera files: what they hold, where they are found, and one line for what is wrong."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import yaml
 
 from pachon import PachonError, load_camera, load_telescope
+from pachon.core.errors import PrescriptionError
 from pachon.models.io.bundled import DATA
 from pachon.models.io.camera_file import CcdSection
 from pachon.models.io.prescription import prescription_digest, save_telescope
@@ -102,7 +104,13 @@ def test_prescriptions_name_a_file_beside_them(file, tmp_path):
         assert load_telescope(tmp_path / f"{kind}.yaml").camera == telescope.camera
 
 
-def test_the_site_of_a_telescope_is_kept(tmp_path):
+def test_site_and_dispersion_corrector_of_a_telescope_are_kept(tmp_path):
     for kind in ("pachon", "batoid"):
         save_telescope(load_telescope("hsc"), tmp_path / f"{kind}.yaml", format=kind)
-        assert load_telescope(tmp_path / f"{kind}.yaml").site == "maunakea"
+        telescope = load_telescope(tmp_path / f"{kind}.yaml")
+        assert (telescope.site, telescope.dispersion_corrector) == ("maunakea", "ADC")
+
+
+def test_an_unknown_dispersion_corrector_is_told():
+    with pytest.raises(PrescriptionError, match=r"dispersion_corrector: unknown surface or group .ADC3"):
+        replace(load_telescope("hsc"), dispersion_corrector="ADC3")
