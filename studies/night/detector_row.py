@@ -16,7 +16,6 @@ from ...core.units import ARCSEC
 from ...measure.adaptive_moments import adaptive_moments
 from ...measure.rho_statistics import trace_of_moments
 from ...models.camera.camera import Camera
-from ...models.camera.photometry import BANDS
 from ...pipeline.experiment import Experiment
 from ...pipeline.simulate.ccd_exposure import NoiseFreeStars
 from ...pipeline.simulate.ccd_model import CcdFit, ModelledMoments
@@ -132,7 +131,8 @@ def effective_time(experiment: Experiment, sigma: float, sky: float, zero_point:
     # The band of a visit has the extinction of its airmass in both.
     extinction = band.extinction / airmass
     nominal_zero_point = band.zero_point + extinction * (airmass - 1.0) - 2.5 * math.log10(band.gain)
-    dark_sky = BANDS[band.name].dark_sky
+    # That of the band is the sky of the visit.
+    dark_sky = experiment.camera.photometry.dark_sky(band.name)
     nominal_sky = sky_electrons_per_pixel(band, 1.0, sky=dark_sky) / band.gain
     seeing = (sigma / nominal_sigma) ** -2
     transparency = 10.0 ** (-0.8 * (nominal_zero_point - (zero_point - 2.5 * math.log10(seconds))))

@@ -116,6 +116,18 @@ def test_effective_time(experiment):
     assert time == pytest.approx(30.0)
 
 
+@pytest.mark.parametrize(("band", "dark", "fwhm"), [("g", 22.04, 0.77), ("z", 18.46, 0.69)])
+def test_effective_time_under_the_dark_sky_of_another_camera(band, dark, fwhm):
+    """As long as the exposure in nominal seeing at the zenith; DECam's dark sky in z is 1.15 mag above the LSST's."""
+    run = {"telescope": "decam", "ccds": ["N4"], "psf": {"engine": "long_exposure"}}
+    visit = listed(band=band, altitude=math.pi / 2, sky=dark, snaps=1)
+    nominal = visit_experiment(configuration_of(run, "test"), visit)
+    columns = detector_row.noise_columns(nominal, 1.0)
+    sigma = fwhm * ARCSEC / nominal.band.pixel_scale / (2 * math.sqrt(2 * math.log(2)))
+    time = detector_row.effective_time(nominal, sigma, columns["skyBg"], columns["zeroPoint"], 1.0)
+    assert time == pytest.approx(30.0)
+
+
 @pytest.mark.parametrize("count", [4, 8, 30])
 def test_shapes_of_maps_at_the_pole(count):
     """The axes of the sky turn within a CCD there: a polynomial of shapes along them was wrong by up to twice g."""
