@@ -117,8 +117,8 @@ def visits_command(
     - `pachon visits --rotator random`: the camera turned against the telescope too, by up to 90 degrees
     - `pachon visits -n 2 --roll 0,0 --rotator 0,45`: a telescope that stands still on the sky, its camera turned
     - `pachon visits my_visits.yaml --set run.band=i`: any key of `pachon config visits`
-    - `pachon visits --list baseline.db --where "night = 5" --band r,i --raft R22 -o night5`: visits of a scheduler, each
-      with its own pointing, angles, band, time and air; a table of PSF and depth, and maps of the sky
+    - `pachon visits --list baseline.db --where "night = 5" --band r,i --raft R22 -o night5`: visits of a scheduler,
+      each with its own pointing, angles, band, time and air; a table of PSF and depth, and maps of the sky
     - `pachon visits --list ddf.db --band r --stack -o ddf`, `pachon null-test ddf`: the visits to one field, stacked
     - `pachon visits --list visits.csv -o night --part 3/8`: one of eight jobs of a batch system, all in one folder
 
