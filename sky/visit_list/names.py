@@ -32,6 +32,7 @@ QUANTITIES = {
     "roll": ListedQuantity("position angle of the telescope", "deg", ("roll_deg", "position_angle_deg")),
     "altitude": ListedQuantity("altitude", "deg", ("altitude",)),
     "zenith_distance": ListedQuantity("zenith distance", "deg", ("zenith_distance", "zenithdistance")),
+    "airmass": ListedQuantity("airmass", "", ("airmass",)),
     "azimuth": ListedQuantity("azimuth", "deg", ("azimuth",)),
     "r0": ListedQuantity("Fried parameter", "m", ("r0_m", "r0", "fried_parameter")),
     "seeing": ListedQuantity("seeing at 500 nm", "arcsec", ("seeingfwhm500", "rawseeing", "seeing")),

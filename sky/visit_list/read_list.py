@@ -29,6 +29,8 @@ READOUT = 2.0
 CATALOGUE_READOUT = 3.0
 #: Difference of altitudes of list and astropy from which a remark is made [rad].
 _ALTITUDE_DIFFERENCE = np.deg2rad(1.0)
+#: Least airmass of a list: fits to it are a little below 1 at the zenith.
+_LEAST_AIRMASS = 0.99
 #: Numbers from which a night is a date YYYYMMDD.
 _FIRST_DATE = 10_000_000
 # Bands by their numbers in instance catalogues.
@@ -310,10 +312,14 @@ def _selection(columns: ListColumns, band: str | None, night: int | None) -> np.
 
 
 def _horizontal(columns: ListColumns, angles: SkyAngles) -> tuple[np.ndarray, np.ndarray]:
-    """Return altitudes and azimuths [rad]: those of the list, those by place and time where it has none."""
-    altitude = columns.numbers("altitude")
+    """Return altitudes and azimuths [rad]: those of the list, by its airmass, or by place and time."""
+    altitude = columns.numbers("altitude").copy()
     if "altitude" not in columns.values and "zenith_distance" in columns.values:
         altitude = 0.5 * np.pi - columns.numbers("zenith_distance")
+    without = ~np.isfinite(altitude)
+    if "airmass" in columns.values and without.any():
+        airmass = columns.rows(without).stated("airmass", lambda airmass: airmass >= _LEAST_AIRMASS, "a number from 1")
+        altitude[without] = np.arcsin(1.0 / np.maximum(airmass, 1.0))
     listed = np.isfinite(altitude)
     if not listed.all():
         visits_have = counted(len(columns), "visit has", "visits have")

@@ -217,6 +217,18 @@ def test_columns_of_consdb(visits, write_list):
     np.testing.assert_allclose(listed.wind_azimuth, np.pi / 2)
 
 
+def test_airmass_where_there_is_no_altitude(write_list):
+    listed = read_visit_list(write_list(airmass=[1.0, 1.2, 2.0, 0.9996, np.nan]))
+    at_place = read_visit_list(write_list())
+    np.testing.assert_allclose(1.0 / np.sin(listed.altitude[:4]), [1.0, 1.2, 2.0, 1.0])
+    assert listed.altitude[4] == at_place.altitude[4]
+    assert any("1 of 5 visits have no altitude" in remark for remark in listed.remarks)
+    with pytest.raises(DomainError, match=r"airmass = -1: expected a number from 1"):
+        read_visit_list(write_list(airmass=[1.0, -1.0, 2.0, 1.0, 1.5]))
+    # Of a list with altitudes it does not matter.
+    read_visit_list(write_list(altitude=[50.0] * 5, airmass=[-1.0] * 5))
+
+
 @pytest.mark.parametrize("ending", [".ecsv", ".fits", ".parquet"])
 def test_tables(visits, tmp_path, ending):
     path = tmp_path / f"visits{ending}"
