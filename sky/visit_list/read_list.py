@@ -35,6 +35,8 @@ _LEAST_AIRMASS = 0.99
 _FIRST_DATE = 10_000_000
 # Bands by their numbers in instance catalogues.
 _BANDS = tuple("ugrizy")
+# Filters of HSC: HSC-G, and HSC-R2 that is in the place of HSC-R.
+_HSC_FILTER = re.compile(r"HSC-([GRIZY])2?", re.IGNORECASE)
 # Angle of an LSST pixel, in which ConsDB has widths [rad].
 _CONSDB_PIXEL = 0.2 * ARCSEC
 _SECONDS_A_DAY = 86400.0
@@ -272,7 +274,7 @@ def _bands(columns: ListColumns) -> np.ndarray:
 
 
 def _band_names(columns: ListColumns) -> np.ndarray:
-    """Return the bands of physical filters such as r_57, and of numbers from 0; others as they are."""
+    """Return the bands of physical filters such as r_57 and HSC-R2, and of numbers from 0; others as they are."""
     values = columns.values.get("band", np.full(len(columns), ""))
     names = []
     for value in values.tolist():
@@ -281,6 +283,8 @@ def _band_names(columns: ListColumns) -> np.ndarray:
             names.append(_BANDS[index] if 0 <= index < len(_BANDS) and index == value else str(value))
             continue
         word = re.split(r"[\s_~]", value.strip(), maxsplit=1)[0]
+        hsc_filter = _HSC_FILTER.fullmatch(word)
+        word = hsc_filter[1] if hsc_filter else word
         names.append(word.lower() if word.lower() in _BANDS else value.strip())
     return np.array(names)
 

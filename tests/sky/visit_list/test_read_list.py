@@ -396,6 +396,14 @@ def test_altitudes_that_do_not_fit_are_said(visits, write_list):
     assert read_visit_list(write_list(altitude=altitude)).remarks == ()
 
 
+def test_filters_of_hsc(write_list):
+    filters = ["HSC-G", "HSC-R2", "HSC-I2", "HSC-Z", "HSC-Y"]
+    listed = read_visit_list(write_list(drop=["band"], physical_filter=filters))
+    assert listed.band.tolist() == ["g", "r", "i", "z", "y"]
+    with pytest.raises(DomainError, match="physical_filter = NB0921: expected one of u, g, r, i, z, y"):
+        read_visit_list(write_list(drop=["band"], physical_filter=[*filters[:4], "NB0921"]))
+
+
 # ---- bad input
 
 
