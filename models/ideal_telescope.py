@@ -40,6 +40,7 @@ def ideal_telescope(telescope: Telescope, focal_ratio: float = 1000.0) -> Telesc
         medium_before=VACUUM,
         groups={},
         group_frames={},
+        dispersion_corrector=None,
         camera=None,
         object_distance=math.inf,
         obstructions=tuple(replace(o, before=("M1",)) for o in obstructions),

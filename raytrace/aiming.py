@@ -248,7 +248,15 @@ def _front_group(telescope: Telescope, stop: int) -> Telescope:
     before = surfaces[-2].medium_after if len(surfaces) > 1 else telescope.medium_before
     last = replace(surfaces[-1], interaction=Interaction.PASS, medium_after=before)
     clear = tuple(replace(s, aperture=None) for s in (*surfaces[:-1], last))
-    return replace(telescope, surfaces=clear, groups={}, group_frames={}, obstructions=(), design_data=DesignData())
+    return replace(
+        telescope,
+        surfaces=clear,
+        groups={},
+        group_frames={},
+        dispersion_corrector=None,
+        obstructions=(),
+        design_data=DesignData(),
+    )
 
 
 def _stop_coordinates(telescope: Telescope, stop: Stop, pupil: np.ndarray) -> np.ndarray:

@@ -224,6 +224,7 @@ class GhostTrace:
             medium_before=medium_before,
             groups={},
             group_frames={},
+            dispersion_corrector=None,
             obstructions=tuple(obstructions),
             design_data=DesignData(),
         )

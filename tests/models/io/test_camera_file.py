@@ -10,6 +10,7 @@ import yaml
 
 from pachon import PachonError, load_camera, load_telescope
 from pachon.core.errors import PrescriptionError
+from pachon.models.ideal_telescope import ideal_telescope
 from pachon.models.io.bundled import DATA
 from pachon.models.io.camera_file import CcdSection
 from pachon.models.io.prescription import prescription_digest, save_telescope
@@ -114,3 +115,7 @@ def test_site_and_dispersion_corrector_of_a_telescope_are_kept(tmp_path):
 def test_an_unknown_dispersion_corrector_is_told():
     with pytest.raises(PrescriptionError, match=r"dispersion_corrector: unknown surface or group .ADC3"):
         replace(load_telescope("hsc"), dispersion_corrector="ADC3")
+
+
+def test_telescopes_in_place_of_one_have_no_dispersion_corrector():
+    assert ideal_telescope(load_telescope("hsc"), 2.0).dispersion_corrector is None
