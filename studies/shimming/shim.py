@@ -50,6 +50,10 @@ _FIT = {"fwhm": 3, "ellipticity": 3, "xi": 5}
 _CHECK = 4
 # Room for motions beyond the largest height [m].
 _ROOM = 10e-6
+# Factor by which the range of heights is widened until the sharpest images lie within.
+_WIDER = 3.0
+# Motions that end within this fraction of the range of heights are minima, not its ends.
+_INSIDE = 1.0 - 1e-4
 #: Merit at each place and its derivative with respect to the height there, of values and slopes [n, 6].
 Value = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 # Lengths of which motions are multiples in the fit [m]: of the piston, and of a tilt at the rim of a part.
@@ -170,33 +174,28 @@ def shim(
     plane, names = experiment.focal_plane, experiment.config.ccds or ()
     fit, check = (Places.gauss(plane, names, order) for order in (_FIT[merit], _CHECK))
     named_parts = _parts_with_places(plane, fit, parts)
+    rows_of_parts = [(center, rows) for _, center, rows in named_parts]
     heights = fit.heights(plane)
     with reporter.stage("widths and ellipticities against height"):
-        curves = focus_curves(experiment, fit, float(np.abs(heights).max()) + _ROOM, threads)
-        if not np.isfinite(curves.coefficients).all():
-            lost = ~np.isfinite(curves.coefficients).all(axis=(0, 2))
-            lost_ccd = plane.names[fit.ccd[np.flatnonzero(lost)[0]]]
-            raise DomainError(f"{lost_ccd}: the PSF has no width or shape within {1e6 * curves.reach:.0f} um of focus")
+        curves = _curves_around_focus(experiment, fit, rows_of_parts, threads)
     sky, sky_checked = (_field_angles(experiment, places, threads) for places in (fit, check))
     edges = _separation_bins(plane, np.concatenate([fit.position, check.position]), np.concatenate([sky, sky_checked]))
     pairs = PairSum.of(sky, fit.weight, edges) if merit == "xi" else None
-    whole_plane = [(np.zeros(2), np.arange(len(fit.ccd)))]
+    whole_plane = _whole_plane(fit)
     with reporter.stage("motions"):
         (focus,) = _best_motions(curves, fit, heights, whole_plane, merit, pairs)
         (level,) = _best_motions(curves, fit, np.zeros_like(heights), whole_plane, merit, pairs)
-        focused = heights + _height_change(focus, fit.position)
-        best = _best_motions(curves, fit, focused, [(center, rows) for _, center, rows in named_parts], merit, pairs)
+        focused = _moved_heights(heights, fit, whole_plane, [focus])
+        best = _best_motions(curves, fit, focused, rows_of_parts, merit, pairs)
     motions = {name: motion for (name, *_), motion in zip(named_parts, best, strict=True)}
-    shimmed = focused.copy()
-    for name, center, rows in named_parts:
-        shimmed[rows] += _height_change(motions[name], fit.position[rows] - center)
+    shimmed = _moved_heights(focused, fit, rows_of_parts, best)
     planes = {
         "as built": plane,
         "focused": moved_whole(plane, focus),
         "shimmed": moved_parts(moved_whole(plane, focus), motions),
         "plane": moved_whole(FocalPlane.flat(plane.camera), level),
     }
-    by_state = (heights, focused, shimmed, _height_change(level, fit.position))
+    by_state = (heights, focused, shimmed, _moved_heights(np.zeros_like(heights), fit, whole_plane, [level]))
     fitted, checked, correlations = {}, {}, {}
     with reporter.stage("check with the engine at other places"):
         for state, at in zip(STATES, by_state, strict=True):
@@ -204,6 +203,59 @@ def shim(
             values = measured(experiment, planes[state], check, threads)
             checked[state], correlations[state] = _state_metrics(check, values, sky_checked, edges)
     return Shims(merit, parts, focus, motions, fitted, checked, correlations, planes["focused"], planes["shimmed"])
+
+
+def _curves_around_focus(
+    experiment: Experiment, fit: Places, parts: Sequence[tuple[np.ndarray, np.ndarray]], threads: int | None
+) -> HeightSeries:
+    """Return the curves over a range of heights in which the whole, a flat plane and the parts are sharpest.
+
+    Bands other than that of the prescription are in focus tens of um away, slow telescopes hundreds.
+    """
+    plane = experiment.focal_plane
+    heights = fit.heights(plane)
+    reach = float(np.abs(heights).max()) + _ROOM
+    while True:
+        curves = focus_curves(experiment, fit, reach, threads)
+        lost = ~np.isfinite(curves.coefficients).all(axis=(0, 2))
+        if lost.any():
+            lost_ccd = plane.names[fit.ccd[np.flatnonzero(lost)[0]]]
+            raise DomainError(f"{lost_ccd}: the PSF has no width or shape within {1e6 * reach:.0f} um of focus")
+        if _farthest_sharpest(curves, fit, heights, parts) < _INSIDE * reach:
+            return curves
+        reach *= _WIDER
+
+
+def _farthest_sharpest(
+    curves: HeightSeries, fit: Places, heights: np.ndarray, parts: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> float:
+    """Return the largest height [m], of either sign, where whole, flat plane or parts are sharpest."""
+
+    def sharpest(before: np.ndarray, moved: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        return _moved_heights(before, fit, moved, _best_motions(curves, fit, before, moved, "fwhm", None))
+
+    whole_plane = _whole_plane(fit)
+    focused = sharpest(heights, whole_plane)
+    level = sharpest(np.zeros_like(heights), whole_plane)
+    return float(np.abs([focused, level, sharpest(focused, parts)]).max())
+
+
+def _whole_plane(places: Places) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return centre and rows of the places of the whole focal plane, as of one part."""
+    return [(np.zeros(2), np.arange(len(places.ccd)))]
+
+
+def _moved_heights(
+    heights: np.ndarray,
+    places: Places,
+    parts: Sequence[tuple[np.ndarray, np.ndarray]],
+    motions: Sequence[Motion],
+) -> np.ndarray:
+    """Return heights [m] at places with parts moved, those of centres [m] and rows."""
+    moved = heights.copy()
+    for (center, rows), motion in zip(parts, motions, strict=True):
+        moved[rows] += _height_change(motion, places.position[rows] - center)
+    return moved
 
 
 def _field_angles(experiment: Experiment, places: Places, threads: int | None) -> np.ndarray:

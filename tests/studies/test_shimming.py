@@ -261,3 +261,23 @@ def test_measured_shapes_are_those_of_hsm(built):
         assert row[G] == pytest.approx([g.g1, g.g2], abs=2e-6)
         sigma = found.moments_sigma * stars.pixel_scale / ARCSEC
         assert row[T] == pytest.approx(2.0 * sigma**2 * (1.0 + g.g**2) / (1.0 - g.g**2), rel=1e-5)
+
+
+def test_a_focus_far_from_the_prescription_is_met(monkeypatch):
+    """Widths of a parabola: bands other than the prescription's are in focus tens of um away, AuxTel 230 um."""
+    built = experiment_of(telescope="decam", band="g", ccds=("N4", "S4"))
+    heights = np.array([-230e-6, -226e-6])
+    middle = np.array([built.camera.ccd_index(name) for name in ("N4", "S4")])
+
+    def widths(experiment, plane, places, threads=None):
+        best = heights[(places.ccd == middle[1]).astype(int)]
+        width = 0.8 + ((places.heights(plane) - best) / 1e-4) ** 2
+        shape = np.full_like(width, 0.01)
+        return np.stack([width, shape, shape, width**2, shape, shape], axis=1)
+
+    monkeypatch.setattr("pachon.studies.shimming.curves.measured", widths)
+    monkeypatch.setattr("pachon.studies.shimming.shim.measured", widths)
+    found = shim(built, parts="ccds", threads=1)
+    assert found.focus.dz == pytest.approx(-228e-6, abs=1e-6)
+    assert found.focal_plane.height(*built.camera.centers[middle].T) == pytest.approx(heights, abs=0.05e-6)
+    assert found.checked["shimmed"].fwhm == pytest.approx(0.8, abs=1e-7)
