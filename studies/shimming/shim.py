@@ -368,14 +368,17 @@ def _minimise_merit(
     row_curves, weight, before = curves.chosen(rows), places.weight[rows], heights[rows]
     design = np.concatenate([_motion_terms(places.position[rows] - center) for center, rows in parts]) * _UNIT
 
+    within = np.clip(before, -row_curves.reach, row_curves.reach)
+    penalty = max(1.0, float(value(row_curves.at(within), row_curves.slope(within))[0].max()))
+
     def merit_function(motion: np.ndarray) -> tuple[float, np.ndarray]:
         moved_heights = before + np.einsum("nk,nk->n", design, motion.reshape(-1, 3)[part_index])
-        # Heights beyond the curves are penalised: the minimum lies within.
+        # Heights beyond the curves are penalised: the minimum lies within, whatever the size of the merit.
         inside = np.clip(moved_heights, -row_curves.reach, row_curves.reach)
         merits, slope = value(row_curves.at(inside), row_curves.slope(inside))
         beyond = (moved_heights - inside) / _UNIT
-        total = merits + beyond**2
-        slope = weight * (np.where(beyond == 0.0, slope, 0.0) + 2.0 * beyond / _UNIT)
+        total = merits + penalty * beyond**2
+        slope = weight * (np.where(beyond == 0.0, slope, 0.0) + 2.0 * penalty * beyond / _UNIT)
         change = np.stack([np.bincount(part_index, slope * along) for along in design.T], axis=1)
         return float(np.einsum("n,n->", weight, total)), change.ravel()
 

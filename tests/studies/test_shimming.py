@@ -15,10 +15,19 @@ from pachon.models.camera.focal_plane import FocalPlane
 from pachon.pipeline.config import Configuration, load_configuration, with_options
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.simulate.ccd_exposure import expose_positions
+from pachon.reconstruction.focal_plane_psf.height_series import HeightSeries
 from pachon.studies.shimming.curves import E, G, Places, T, focus_curves, measured
 from pachon.studies.shimming.pairs import PairSum, separation_edges
 from pachon.studies.shimming.product import shim_metrics
-from pachon.studies.shimming.shim import STATES, Motion, draw_shims, moved_parts, shim, shimmed_configuration
+from pachon.studies.shimming.shim import (
+    STATES,
+    Motion,
+    _best_motions,
+    draw_shims,
+    moved_parts,
+    shim,
+    shimmed_configuration,
+)
 from pachon.wavefront.chief_rays import fields_at
 
 # Three CCDs that are not in a row hold a raft.
@@ -281,3 +290,17 @@ def test_a_focus_far_from_the_prescription_is_met(monkeypatch):
     assert found.focus.dz == pytest.approx(-228e-6, abs=1e-6)
     assert found.focal_plane.height(*built.camera.centers[middle].T) == pytest.approx(heights, abs=0.05e-6)
     assert found.checked["shimmed"].fwhm == pytest.approx(0.8, abs=1e-7)
+
+
+def test_motions_stay_within_the_curves_however_large_the_merit():
+    """A tilt by which two columns of places are rounder would lift the third, whose g is constant, to 90 um of 30."""
+    places = Places.gauss(FocalPlane.flat("decam"), ("N4",), 3)
+    column = np.rint(places.offset[:, 0] / np.abs(places.offset[:, 0]).max()).astype(int)
+    coefficients = np.zeros((2, len(places.ccd), 6))
+    coefficients[0, :, G.start] = 0.1
+    coefficients[1, :, G.start] = np.choose(column + 1, [0.09, -0.09, 0.0])
+    curves = HeightSeries(coefficients, 30e-6)
+    center, rows = places.position.mean(axis=0), np.arange(len(places.ccd))
+    (motion,) = _best_motions(curves, places, np.zeros(len(rows)), [(center, rows)], "ellipticity", None)
+    heights = motion.dz - (places.position[:, 0] - center[0]) * np.tan(motion.ry)
+    assert 29e-6 < np.abs(heights).max() < 31e-6
