@@ -34,6 +34,7 @@ from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL, FastEngine
 from ..wavefront.psf.long_exposure import LongExposureEngine
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .alignment_states import with_active_optics_state
+from .band_focus import refocus
 from .config import AtmosphereConfig, BandName, Configuration, PsfConfig, ReconstructionConfig
 from .config_checks import WEIGHT_PIXELS, check_combinations
 from .dispersion import with_dispersion_corrected
@@ -103,9 +104,11 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
         camera_name = _absolute_path(config.camera, folder, CAMERAS, CAMERA_ENDINGS)
     camera = _camera_of(telescope, camera_name)
     ends = telescope.band or telescope.wavelength_range
+    changes = config.changes
     # The light of another filter than that of the model, or of one filter where the model has none.
     if band is not None and (band != named_band or ends == telescope.wavelength_range):
-        ends = camera.photometry.edges(band)
+        prescribed, ends = telescope.band or (telescope.default_wavelength,) * 2, camera.photometry.edges(band)
+        changes = changes | refocus(telescope, camera, ends, prescribed, changes)
     band = band or named_band
     atmosphere = config.atmosphere
     site_name = _absolute_path(atmosphere.site or telescope.site or SITE, folder, ())
@@ -150,6 +153,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
             "camera": camera_name,
             "ccds": chosen_ccds(camera, default_ccds(camera) if config.ccds is None else config.ccds),
             "wavelengths_nm": wavelengths,
+            "changes": changes,
             "photometry": light,
             "stars": stars,
             "focal_plane": plane,

@@ -1,0 +1,82 @@
+"""Focus of a telescope in another band than that of its prescription, as an observatory has it in each band."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..models.camera.camera import Camera
+from ..models.telescope import Telescope
+from ..raytrace.rays import RayStatus, field_direction, parallel_rays
+from ..raytrace.trace import trace
+from ..wavefront.chief_rays import fields_at
+
+#: Rings of rays across the pupil; each has six rays more than the one within.
+_RINGS = 6
+#: Wavelengths of a band.
+_WAVELENGTHS = 5
+#: CCDs from which on their centres sample the field.
+_MANY = 9
+#: Shifts below are none [um].
+_LEAST_UM = 0.5
+
+
+def refocus(
+    telescope: Telescope,
+    camera: Camera,
+    band: tuple[float, float],
+    prescribed: tuple[float, float],
+    changes: Mapping[str, float],
+) -> dict[str, float]:
+    """Return the change of a prescription that brings light of another band into focus, by its key.
+
+    The detector moves to where spots are smallest on all CCDs, by no more than this height differs from that of the
+    light of the prescription: mirrors stay as they are. So does a detector that changes move along the axis already.
+
+    Parameters
+    ----------
+    telescope, camera
+        Telescope as prescribed, and its CCDs.
+    band, prescribed : (float, float)
+        Ends of the band, and of that of the prescription [m].
+    changes : mapping
+        Changes of the prescription: ``{"Detector.dz_um": 10.0}``.
+    """
+    detector = telescope.surfaces[-1].name
+    for key in changes:
+        moved, _, motion = key.rpartition(".")
+        if motion.startswith("dz") and detector in (moved, *telescope.groups.get(moved, ())):
+            return {}
+    best, before = (_best_focus(telescope, camera, np.linspace(*ends, _WAVELENGTHS)) for ends in (band, prescribed))
+    nearest, farthest = sorted((0.0, best - before))
+    shift = round(1e6 * float(np.clip(best, nearest, farthest)), 1)
+    return {f"{detector}.dz_um": shift} if math.isfinite(shift) and abs(shift) > _LEAST_UM else {}
+
+
+def _best_focus(telescope: Telescope, camera: Camera, wavelengths: np.ndarray) -> float:
+    """Return the height above the detector where the spots have the least mean square radius [m]; NaN without light."""
+    places = (
+        camera.centers
+        if len(camera) >= _MANY
+        else np.concatenate([camera.centers, *camera.corners(range(len(camera)))])
+    )
+    fields = fields_at(telescope, places)
+    fields = fields[np.hypot(*fields.T) <= telescope.field_radius]
+    angles = [2.0 * np.pi * np.arange(6 * ring) / (6 * ring) for ring in range(1, _RINGS + 1)]
+    rings = [(ring - 0.5) / _RINGS * np.stack([np.cos(a), np.sin(a)], axis=1) for ring, a in enumerate(angles, start=1)]
+    pupil = 0.5 * telescope.pupil_diameter * np.concatenate(rings)
+    shape, detector, towards, square = (len(fields), len(pupil)), telescope.surfaces[-1], 0.0, 0.0
+    for wavelength in wavelengths:
+        rays = parallel_rays(telescope, field_direction(*fields.T), float(wavelength), pupil)
+        end = trace(telescope, rays)
+        lit = (end.status == RayStatus.OK).reshape(shape)
+        travel = detector.along(end.direction)
+        slopes, places = travel[:, :2] / travel[:, 2:], detector.to_local(end.position)[:, :2]
+        for slope, place, used in zip(slopes.reshape(*shape, 2), places.reshape(*shape, 2), lit, strict=True):
+            if used.any():
+                slope, place = (v[used] - v[used].mean(axis=0) for v in (slope, place))
+                towards += float((slope * place).sum())
+                square += float((slope**2).sum())
+    return -towards / square if square else math.nan
