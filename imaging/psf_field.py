@@ -88,7 +88,8 @@ class PsfField:
         PachonError
             As :meth:`pachon.PsfModel.fit`.
         DomainError
-            If the number of cells is not odd, or does not divide the sides of the stamps.
+            If the number of cells is not odd, or does not divide the sides of the stamps, or a lit fraction is not
+            finite.
         """
         if cells < 1 or cells % 2 == 0 or any(side % cells for side in np.shape(stamps)[1:]):
             raise DomainError(f"cells = {cells}: expected an odd number that divides the sides of {np.shape(stamps)}")
@@ -107,6 +108,8 @@ class PsfField:
             model = fitted("kriging")
         share = 1.0 if lit_fraction is None else lit_fraction
         light = for_each(pure_numbers(share, "lit_fraction"), len(places), "lit_fraction")
+        if not np.isfinite(light).all():
+            raise DomainError(f"lit_fraction[{np.isfinite(light).argmin()}]: expected a finite number")
         return cls(model, size, LitFraction.fit(places, light, extent, order), cells)
 
     @classmethod

@@ -57,12 +57,20 @@ def error_covariance(stamps: GaussianStamps, minimum: np.ndarray, equations: Nor
         curvature[:, :, k] = change / (_STEP * scale[:, k, None])
     first = _MOMENTS[0]
     curvature[:, first:, :first] = curvature[:, :first, first:].swapaxes(1, 2)
+    # Of a stamp without light a step may lead anywhere.
+    finite = np.isfinite(curvature).all(axis=(1, 2))
+    curvature, scale, regular = curvature[finite], scale[finite], regular[finite]
     # Whitened by the Fisher matrix: ones where the model fits, from which noise takes no more than a part.
-    scaled_covariance = covariance[regular] / (scale[:, :, None] * scale[:, None, :])
-    root = np.linalg.cholesky(scaled_covariance)
+    root = _root_of(covariance[regular] / (scale[:, :, None] * scale[:, None, :]))
     scaled = curvature * (scale[:, :, None] * scale[:, None, :])
     whitened = root.swapaxes(1, 2) @ (0.5 * (scaled + scaled.swapaxes(1, 2))) @ root
     values, directions = np.linalg.eigh(whitened)
     factors = root @ directions / np.maximum(values, _LEAST_CURVATURE)[:, None, :]
     covariance[regular] = factors @ factors.swapaxes(1, 2) * (scale[:, :, None] * scale[:, None, :])
     return covariance
+
+
+def _root_of(matrix: np.ndarray) -> np.ndarray:
+    """Return R with R R^T = M of positive matrices [n, k, k], whose least eigenvalues may be rounding."""
+    values, directions = np.linalg.eigh(matrix)
+    return np.asarray(directions * np.sqrt(np.maximum(values, 0.0))[:, None, :])
