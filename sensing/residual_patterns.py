@@ -35,6 +35,8 @@ _WELL_FIGURED = 0.1
 _HOPELESS = 20.0
 #: Least variance by noise of an amplitude that fitted terms take up, over that by noise alone: derivatives are as good.
 _LEAST_NOISE = 5e-3
+#: Part of the largest power that is rounding, in single precision.
+_ROUNDING = 1e-6
 #: Loss of the logarithm of the likelihood by a level that is fitted.
 _WORTH = 2.0
 #: The same without air: a cheap level would take what the telescope has of large terms, and claims would be too small.
@@ -137,7 +139,12 @@ class Patterns:
         ``base`` is the covariance of the amplitudes without the field, ``worth`` the loss by a level.
         """
         strengths = np.exp(2.0 * RMS_LOGARITHMS)
-        variances, vectors = eigh(np.diag(self.variances), base)
+        try:
+            variances, vectors = eigh(np.diag(self.variances), base)
+        except np.linalg.LinAlgError:
+            # What the telescope has outweighs the noise of very bright images by more than the digits of its power.
+            base = base + _ROUNDING * np.diag(base).max() * np.eye(len(base))
+            variances, vectors = eigh(np.diag(self.variances), base)
         energies = (vectors.T @ self.amplitudes) ** 2
         # Up to beyond the logarithm of their mean square, where the field lowers the level.
         levels = np.exp(np.linspace(0.0, math.log(max(float(energies.mean()), 1.0)) + 1.0, _LEVELS))
