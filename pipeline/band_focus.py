@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import lru_cache
 
 import numpy as np
 
@@ -49,13 +50,14 @@ def refocus(
         moved, _, motion = key.rpartition(".")
         if motion.startswith("dz") and detector in (moved, *telescope.groups.get(moved, ())):
             return {}
-    best, before = (_best_focus(telescope, camera, np.linspace(*ends, _WAVELENGTHS)) for ends in (band, prescribed))
+    best, before = (_best_focus(telescope, camera, light) for light in (band, prescribed))
     nearest, farthest = sorted((0.0, best - before))
     shift = round(1e6 * float(np.clip(best, nearest, farthest)), 1)
     return {f"{detector}.dz_um": shift} if math.isfinite(shift) and abs(shift) > _LEAST_UM else {}
 
 
-def _best_focus(telescope: Telescope, camera: Camera, wavelengths: np.ndarray) -> float:
+@lru_cache(maxsize=16)
+def _best_focus(telescope: Telescope, camera: Camera, band: tuple[float, float]) -> float:
     """Return the height above the detector where the spots have the least mean square radius [m]; NaN without light."""
     places = (
         camera.centers
@@ -68,7 +70,7 @@ def _best_focus(telescope: Telescope, camera: Camera, wavelengths: np.ndarray) -
     rings = [(ring - 0.5) / _RINGS * np.stack([np.cos(a), np.sin(a)], axis=1) for ring, a in enumerate(angles, start=1)]
     pupil = 0.5 * telescope.pupil_diameter * np.concatenate(rings)
     shape, detector, towards, square = (len(fields), len(pupil)), telescope.surfaces[-1], 0.0, 0.0
-    for wavelength in wavelengths:
+    for wavelength in np.linspace(*band, _WAVELENGTHS):
         rays = parallel_rays(telescope, field_direction(*fields.T), float(wavelength), pupil)
         end = trace(telescope, rays)
         lit = (end.status == RayStatus.OK).reshape(shape)
