@@ -239,7 +239,7 @@ def _camera_of(telescope: Telescope, name: str | None) -> Camera:
 
 
 def _stamp_geometry(stamp: int | None, air: AtmosphereConfig, telescope: Telescope, camera: Camera) -> dict[str, float]:
-    """Return the default pixels [um] and, where it is open, size of stamps: on the sky that of the LSST's.
+    """Return the default pixels [um] and, where it is open, side of stamps, as large on the sky as those of the LSST.
 
     Those of wide PSFs are larger: light beyond the rim wraps around.
     """

@@ -113,11 +113,15 @@ class CameraPhotometry:
 
     def edges(self, name: str) -> tuple[float, float]:
         """Return the ends of a band [m], those of the LSST's where it is not measured."""
-        return next((band for band in self.bands if band.name == name), BANDS[name]).wavelength_range
+        return self._measured(name).wavelength_range
 
     def dark_sky(self, name: str) -> float:
         """Return the brightness of a dark sky in a band [AB mag/arcsec^2], the LSST's where it is not measured."""
-        return next((band for band in self.bands if band.name == name), BANDS[name]).dark_sky
+        return self._measured(name).dark_sky
+
+    def _measured(self, name: str) -> Band:
+        """Return a measured band, or that of the LSST."""
+        return next((band for band in self.bands if band.name == name), BANDS[name])
 
     def band(self, camera: str, name: str, area: float, wavelengths: tuple[float, float]) -> Band:
         """Return a band, estimated as of :func:`estimated_band` where none is measured.

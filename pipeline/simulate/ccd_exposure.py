@@ -23,7 +23,7 @@ from ...wavefront.psf.stamps import Stamps
 from ..experiment import Experiment
 from ..resolved_values import resolved_value
 from ..sensor.displacement import displace_stamps
-from .photometry import PROVISIONAL_FWHM, electrons, light_of_sky, limiting_magnitude, vignetted
+from .photometry import PROVISIONAL_FWHM, electrons, limiting_magnitude, vignetted
 from .star_field import CcdOutline, Depth, StarField, make_star_field
 
 #: Pixels by which the stamp of an observed star is larger than the final one: room to centre it on a pixel.
@@ -338,7 +338,7 @@ def ccd_stars(experiment: Experiment, name: str, width: float, least_light: floa
     """
     config, camera, listed = experiment.config, experiment.camera, experiment.star_list
     band, exposure = experiment.band, config.atmosphere.exposure_s
-    at_rim = vignetted(band, light_of_sky(np.array([least_light])))
+    at_rim = vignetted(band, least_light)
     faint = limiting_magnitude(config.stars.snr_min, at_rim, exposure, width) + 2.5 * np.log10(least_light)
     depth = Depth(band, exposure, faint=faint)
     try:

@@ -74,16 +74,18 @@ def sky_electrons_per_pixel(
 
 
 def light_of_sky(lit_fraction: np.ndarray) -> float:
-    """Return the part of the sky's light that arrives at stars [n], in their mean; 1 without stars.
-
-    It is one to a thousandth, so that the noise of stars without vignetting is that on the axis.
-    """
-    return max(round(float(np.mean(lit_fraction)), 3), _LEAST_LIGHT) if len(lit_fraction) else 1.0
+    """Return the part of the sky's light that arrives at stars [n], in their mean; 1 without stars."""
+    return _rounded_light(float(np.mean(lit_fraction))) if len(lit_fraction) else 1.0
 
 
 def vignetted(band: Band, light: float) -> Band:
     """Return a band with the sky of a part of the field where so much of the light on the axis arrives."""
-    return replace(band, dark_sky=band.dark_sky - 2.5 * float(np.log10(light)))
+    return replace(band, dark_sky=band.dark_sky - 2.5 * float(np.log10(_rounded_light(light))))
+
+
+def _rounded_light(light: float) -> float:
+    """Return light to a thousandth, so that the noise of stars without vignetting is that on the axis."""
+    return max(round(light, 3), _LEAST_LIGHT)
 
 
 def instrument_noise(band: str | Band, exposure: float) -> float:

@@ -106,7 +106,7 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
     seed, light = experiment.config.seed, exposed.lit_fraction
     width = effective_fwhm(ccd.exposure.holdout.image, ccd.exposure.holdout.pixel_scale)
     sky_light = light_of_sky(light)
-    at_rim = vignetted(places.band, light_of_sky(light[[light.argmin()]]))
+    at_rim = vignetted(places.band, float(light.min()))
     faint = limiting_magnitude(snr_min, at_rim, places.exposure, width) + 2.5 * np.log10(light.min())
     # The same stars in the same order; the limit alone changes.
     depth = Depth(places.band, places.exposure, faint=faint)
