@@ -213,15 +213,16 @@ def expose(
     mask = np.zeros(scene.shape, dtype=np.int16)
     well, gain = exposure.well, exposure.gain
     read = exposure.exposures * exposure.read_noise**2
-
     beside = 0 if exposure.brighter_fatter is None else _BESIDE
 
     def fill(band: int) -> None:
         rows = slice(band * _ROWS, (band + 1) * _ROWS)
         first = max(rows.start - beside, 0)
         wide, inner = slice(first, rows.stop + beside), slice(rows.start - first, rows.stop - first)
-        background = exposure.background_of(1.0 if lit_fraction is None else lit_fraction(wide))
-        collected = _collected(scene[wide].astype(np.float64) + background, exposure)[inner]
+        light = scene[wide].astype(np.float64)
+        lit = 1.0 if lit_fraction is None else lit_fraction(wide)
+        background = np.broadcast_to(exposure.background_of(lit), light.shape)
+        collected = _collected(light + background, exposure)[inner]
         variance[rows] = (np.maximum(collected, 0.0) + read) / gain**2
         if exposure.noise:
             random = stream(seed, "image noise", *key, band)
@@ -230,7 +231,7 @@ def expose(
         mask[rows][collected >= well] |= SATURATED
         collected = np.minimum(collected, well)
         if exposure.subtract_background:
-            collected -= background[inner] if isinstance(background, np.ndarray) else background
+            collected -= background[inner]
         image[rows] = collected / gain
 
     with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
