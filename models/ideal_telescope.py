@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 from .aperture import Annulus
-from .design_data import DesignData
 from .shapes.shape import Conic, Plane
 from .surface import Interaction, Surface
 from .telescope import VACUUM, Telescope
@@ -27,24 +26,17 @@ def ideal_telescope(telescope: Telescope, focal_ratio: float = 1000.0) -> Telesc
     ring = Annulus(telescope.pupil_obscuration * outer, outer)
     first = next((s.name for s in telescope.surfaces if s.interaction != Interaction.PASS), "")
     obstructions = (o for o in telescope.obstructions if o.before is None or first in o.before)
+    surfaces = (
+        Surface("M1", Interaction.MIRROR, Conic(2.0 * length, -1.0), origin, VACUUM, ring),
+        Surface("Detector", Interaction.DETECTOR, Plane(), focus, VACUUM),
+    )
     return replace(
-        telescope,
+        telescope.with_other_surfaces(surfaces, VACUUM, [replace(o, before=("M1",)) for o in obstructions]),
         name=f"paraboloid of f/{focal_ratio:g}",
-        surfaces=(
-            Surface("M1", Interaction.MIRROR, Conic(2.0 * length, -1.0), origin, VACUUM, ring),
-            Surface("Detector", Interaction.DETECTOR, Plane(), focus, VACUUM),
-        ),
         stop_z=0.0,
         launch_distance=1.5 * length,
         reference_sphere_radius=length,
-        medium_before=VACUUM,
-        groups={},
-        group_frames={},
-        dispersion_corrector=None,
         camera=None,
         object_distance=math.inf,
-        obstructions=tuple(replace(o, before=("M1",)) for o in obstructions),
-        # Stop, fields and links are those of the surfaces that are gone.
-        design_data=DesignData(),
         pupil_center=(0.0, 0.0),
     )

@@ -6,7 +6,7 @@ Telescope frame: right-handed, origin at the vertex of the primary, +z along the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from types import MappingProxyType
@@ -234,6 +234,24 @@ class Telescope(Pictured):
         """
         changed = replace(self.surface(name), shape=shape)
         return replace(self, surfaces=tuple(changed if s.name == name else s for s in self.surfaces))
+
+    def with_other_surfaces(
+        self, surfaces: Sequence[Surface], medium_before: Medium, obstructions: Sequence[Obstruction] = ()
+    ) -> Telescope:
+        """Return the telescope with other surfaces and obstructions, in a medium before them.
+
+        Groups, dispersion corrector, stop, fields and links are of the surfaces that are gone: it has none.
+        """
+        return replace(
+            self,
+            surfaces=tuple(surfaces),
+            medium_before=medium_before,
+            obstructions=tuple(obstructions),
+            groups={},
+            group_frames={},
+            dispersion_corrector=None,
+            design_data=DesignData(),
+        )
 
     def with_coatings(self, coatings: Mapping[str, AnyCoating]) -> Telescope:
         """Return the telescope with coatings of surfaces by their names, and of no others.

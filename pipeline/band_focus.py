@@ -11,6 +11,7 @@ import numpy as np
 from ..models.camera.camera import Camera
 from ..models.telescope import Telescope
 from ..raytrace.rays import RayStatus, field_direction, parallel_rays
+from ..raytrace.spot_parabola import lowest_height, spot_parabola
 from ..raytrace.trace import trace
 from ..wavefront.chief_rays import fields_at
 
@@ -69,16 +70,14 @@ def _best_focus(telescope: Telescope, camera: Camera, band: tuple[float, float])
     angles = [2.0 * np.pi * np.arange(6 * ring) / (6 * ring) for ring in range(1, _RINGS + 1)]
     rings = [(ring - 0.5) / _RINGS * np.stack([np.cos(a), np.sin(a)], axis=1) for ring, a in enumerate(angles, start=1)]
     pupil = 0.5 * telescope.pupil_diameter * np.concatenate(rings)
-    shape, detector, towards, square = (len(fields), len(pupil)), telescope.surfaces[-1], 0.0, 0.0
+    shape, detector, total = (len(fields), len(pupil)), telescope.surfaces[-1], np.zeros(3)
     for wavelength in np.linspace(*band, _WAVELENGTHS):
         rays = parallel_rays(telescope, field_direction(*fields.T), float(wavelength), pupil)
         end = trace(telescope, rays)
-        lit = (end.status == RayStatus.OK).reshape(shape)
+        light = (end.status == RayStatus.OK).reshape(shape).astype(np.float64)
         travel = detector.along(end.direction)
-        slopes, places = travel[:, :2] / travel[:, 2:], detector.to_local(end.position)[:, :2]
-        for slope, place, used in zip(slopes.reshape(*shape, 2), places.reshape(*shape, 2), lit, strict=True):
-            if used.any():
-                slope, place = (v[used] - v[used].mean(axis=0) for v in (slope, place))
-                towards += float((slope * place).sum())
-                square += float((slope**2).sum())
-    return -towards / square if square else math.nan
+        place, slope = detector.to_local(end.position)[:, :2], travel[:, :2] / travel[:, 2:]
+        lit = light.any(axis=1)
+        parabolas = spot_parabola(place.reshape(*shape, 2)[lit], slope.reshape(*shape, 2)[lit], light[lit])
+        total += light[lit].sum(axis=1) @ parabolas
+    return float(lowest_height(total))

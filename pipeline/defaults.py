@@ -165,9 +165,8 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
             ),
         }
     )
-    telescope = configured_telescope(telescope, resolved)
     check_combinations(resolved, telescope, _pixel_arcsec(resolved.psf, telescope))
-    telescope = with_dispersion_corrected(telescope, resolved, site)
+    telescope = configured_telescope(telescope, resolved, site)
     # Stars may fall anywhere on a CCD: all of it must be within the field.
     corner_fields(telescope, camera, resolved.ccds or ())
     check_screens(resolved, telescope, camera, site)
@@ -266,14 +265,17 @@ def _moment_weight(enabled: bool, psf: PsfConfig, telescope: Telescope) -> float
     return max(_WEIGHT if enabled else _WEIGHT_ALONE, round(least, 3))
 
 
-def configured_telescope(telescope: Telescope, config: Configuration) -> Telescope:
-    """Return a telescope with the changes, the state of the visit and the rotator angle of a configuration."""
+def configured_telescope(telescope: Telescope, config: Configuration, site: Site) -> Telescope:
+    """Return a telescope with the changes, the state of the visit and the rotator angle of a configuration.
+
+    Its dispersion corrector, if it has one, is where light of the band needs it.
+    """
     telescope = apply_changes(telescope, config.changes)
     states = config.active_optics.states
     if states is not None:
         with error_context(key="active_optics.states"):
             telescope = with_active_optics_state(telescope, states, config.atmosphere.epoch)
-    return telescope.with_rotator(math.radians(config.rotator_deg))
+    return with_dispersion_corrected(telescope.with_rotator(math.radians(config.rotator_deg)), config, site)
 
 
 def chosen_ccds(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:

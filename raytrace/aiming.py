@@ -14,7 +14,6 @@ import numpy as np
 
 from ..core.errors import DomainError
 from ..core.units import field_label
-from ..models.design_data import DesignData
 from ..models.surface import Interaction, Surface
 from ..models.telescope import Telescope
 from .landing import Landing, derivatives, determinants, find_points, solve_2x2
@@ -248,15 +247,7 @@ def _front_group(telescope: Telescope, stop: int) -> Telescope:
     before = surfaces[-2].medium_after if len(surfaces) > 1 else telescope.medium_before
     last = replace(surfaces[-1], interaction=Interaction.PASS, medium_after=before)
     clear = tuple(replace(s, aperture=None) for s in (*surfaces[:-1], last))
-    return replace(
-        telescope,
-        surfaces=clear,
-        groups={},
-        group_frames={},
-        dispersion_corrector=None,
-        obstructions=(),
-        design_data=DesignData(),
-    )
+    return telescope.with_other_surfaces(clear, telescope.medium_before)
 
 
 def _stop_coordinates(telescope: Telescope, stop: Stop, pupil: np.ndarray) -> np.ndarray:

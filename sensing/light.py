@@ -11,6 +11,7 @@ from ..core.errors import ConfigError, DomainError
 from ..models.telescope import Telescope
 from ..raytrace.launch import launch_bundles
 from ..raytrace.rays import RayStatus
+from ..raytrace.spot_parabola import lowest_height, spot_parabola
 from ..raytrace.trace import TraceResult, trace
 from ..wavefront.chief_rays import image_jacobians
 from ..wavefront.psf.light import Light
@@ -351,10 +352,9 @@ def _landing(telescope: Telescope, end: TraceResult) -> tuple[np.ndarray, float]
     if not lit.any():
         raise DomainError("no light passes the telescope")
     place, travel = detector.to_local(end.position[lit])[:, :2], detector.along(end.direction[lit])
-    slopes = travel[:, :2] / travel[:, 2:]
-    place, slopes = (v - v.mean(axis=0) for v in (place, slopes))
-    # The rays are closest to each other where the detector moved by this distance would be.
-    return place, -float((place * slopes).sum() / max((slopes**2).sum(), 1e-300))
+    parabola = spot_parabola(place, travel[:, :2] / travel[:, 2:], np.ones(len(place)))
+    # A single ray has no focus.
+    return place - place.mean(axis=0), float(np.nan_to_num(lowest_height(parabola)))
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ import numpy as np
 from ...core.errors import DomainError, unknown_name
 from ...core.threads import thread_count
 from ...models.camera.focal_plane import FocalPlane
-from ...models.design_data import DesignData
 from ...models.media.medium import Medium
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
@@ -218,16 +217,7 @@ class GhostTrace:
                 obstructions.append(obstruction)
             elif met := tuple(name for name in obstruction.before if name in names):
                 obstructions.append(replace(obstruction, before=met))
-        return replace(
-            self._telescope,
-            surfaces=tuple(surfaces),
-            medium_before=medium_before,
-            groups={},
-            group_frames={},
-            dispersion_corrector=None,
-            obstructions=tuple(obstructions),
-            design_data=DesignData(),
-        )
+        return self._telescope.with_other_surfaces(surfaces, medium_before, obstructions)
 
     def _landing(self, first: str, second: str, beam: _Beam) -> GhostLight:
         detector, lit = self._telescope.surfaces[-1], beam.weight > 0.0

@@ -1,8 +1,7 @@
 """Spots and wavefronts against the height of the detector, and the height of best focus.
 
-Behind the last surface rays are straight, so one trace serves all heights: landing points move in proportion to the
-height, and the mean square radius is a parabola in it, whose minimum is known without a search. The wavefront refers at
-each height to a sphere about the landing point of the chief ray there.
+Behind the last surface rays are straight, so one trace serves all heights. The wavefront refers at each height to a
+sphere about the landing point of the chief ray there.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import require_image
 from ...raytrace.rays import Projection
+from ...raytrace.spot_parabola import lowest_height, spot_parabola
 from ...wavefront.bundles import Bundles
 from ...wavefront.chief_rays import reference_rays
 from ...wavefront.pupil_sampling import PupilSampling, SamplingName
@@ -165,9 +165,7 @@ def through_focus(
     parallel = np.sqrt(square[:, 2]) < PARALLEL
     if parallel.any():
         raise DomainError(f"{field_label(request.fields[parallel][0])}: the light is parallel; expected a focus")
-    best = -square[:, 1] / (2.0 * square[:, 2])
-    total = request.field_weights @ square
-    common = float(-total[1] / (2.0 * total[2]))
+    best, common = lowest_height(square), float(lowest_height(request.field_weights @ square))
     smallest = np.sqrt(np.maximum(np.polynomial.polynomial.polyval(best, square.T, tensor=False), 0.0))
     if defocus is None:
         principal = principal_rays_of(request)
@@ -199,25 +197,15 @@ def through_focus(
 
 def _mean_squares(request: Request, bundles: list[Bundles]) -> np.ndarray:
     """Return the mean square radius of each field as a parabola in the height, coefficients [n_field, 3]."""
+    n_field = len(request.fields)
     lit = np.stack([b.lit for b in bundles], axis=1)
-    weight = np.where(lit, request.weights[:, None] * request.pupil.weights, 0.0)
-    light = weight.sum(axis=(1, 2))
+    weight = np.where(lit, request.weights[:, None] * request.pupil.weights, 0.0).reshape(n_field, -1)
+    light = weight.sum(axis=1)
     if not (light > 0).all():
         raise DomainError(f"{field_label(request.fields[~(light > 0)][0])}: no light reaches the detector")
-    weight /= light[:, None, None]
-    start = np.stack([b.landing() for b in bundles], axis=1)
+    place = np.stack([b.landing() for b in bundles], axis=1)
     slope = np.stack([b.direction[..., :2] / b.direction[..., 2:] for b in bundles], axis=1)
-
-    def centered(values: np.ndarray) -> np.ndarray:
-        values = np.where(lit[..., None], values, 0.0)
-        return values - np.einsum("fwp,fwpi->fi", weight, values)[:, None, None]
-
-    start, slope = centered(start), centered(slope)
-
-    def mean(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.einsum("fwp,fwpi,fwpi->f", weight, a, b)
-
-    return np.stack([mean(start, start), 2.0 * mean(start, slope), mean(slope, slope)], axis=-1)
+    return spot_parabola(place.reshape(n_field, -1, 2), slope.reshape(n_field, -1, 2), weight)
 
 
 def _wavefronts(request: Request, bundles: list[Bundles], heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

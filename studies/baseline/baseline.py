@@ -32,7 +32,6 @@ from ...pipeline.config_hash import (
     hashed_states,
 )
 from ...pipeline.defaults import configured_telescope, with_paper_model
-from ...pipeline.dispersion import with_dispersion_corrected
 from ...pipeline.experiment import Experiment
 from ..metrics.camera import CAMERA
 from ..metrics.metric import REASONS, Metric, MetricGroup
@@ -299,9 +298,8 @@ def _experiment(run: Configuration, file: Path, model: str, telescope: Telescope
         # Kriging looks for its covariance in steps that rounding may change; metrics need a model of one solution.
         config = with_options(with_paper_model(run), telescope=model, psf__engine=engine)
         experiment = Experiment.from_config(config, file.parent)
-        telescope = configured_telescope(telescope, experiment.config)
-        corrected = with_dispersion_corrected(telescope, experiment.config, experiment.site)
-        return replace(experiment, telescope=corrected)
+        telescope = configured_telescope(telescope, experiment.config, experiment.site)
+        return replace(experiment, telescope=telescope)
     except PachonError as error:
         raise ConfigError(f"{file}: {error}") from None
 
