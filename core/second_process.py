@@ -14,6 +14,7 @@ from typing import Any
 
 from .errors import ProductError
 from .launch_threads import end_if_alone
+from .process_pool import first_done
 from .threads import thread_count
 from .workers import begin_worker
 
@@ -41,7 +42,7 @@ def second_process(threads: int | None = None) -> Iterator[Submit]:
     def submit(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
         # The pool would pickle arguments in a thread of its own, while this one goes on to change what they hold.
         future = pool.submit(_run_pickled, bytes(ForkingPickler.dumps((function, arguments))))
-        return lambda: _result(future)
+        return lambda: _result(pool, future)
 
     try:
         # A process is started by the first computation.
@@ -61,8 +62,9 @@ def _run_at_once(function: Callable[..., Any], *arguments: Any) -> Callable[[], 
     return lambda: result
 
 
-def _result(future: Future[Any]) -> Any:
+def _result(pool: ProcessPoolExecutor, future: Future[Any]) -> Any:
     try:
+        first_done(pool, [future])
         return future.result()
     except BrokenProcessPool:
         raise ProductError(

@@ -12,7 +12,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,6 +22,7 @@ from typing import Any
 from .arguments import check_arguments
 from .errors import ProductError
 from .number_text import counted
+from .process_pool import first_done
 from .threads import thread_count
 from .units import require_count
 
@@ -92,10 +93,10 @@ def process_workers(compute: Compute, count: int, threads: int | None = None) ->
                 for job in jobs:
                     waiting.add(pool.submit(compute, job, threads_per_process))
                     if len(waiting) >= JOBS_AHEAD * count:
-                        done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                        done, waiting = first_done(pool, waiting)
                         yield from (future.result() for future in done)
                 while waiting:
-                    done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                    done, waiting = first_done(pool, waiting)
                     yield from (future.result() for future in done)
             except BrokenProcessPool:
                 raise ProductError(

@@ -9,6 +9,26 @@ import time
 import pytest
 from drivers import lives
 
+_HALFWAY = """
+import os, signal, struct, sys, time
+from pachon.core.errors import ProductError
+from pachon.core.workers import process_workers
+
+def halfway(number, threads):
+    if number:
+        time.sleep(0.2)
+        return number
+    queue = sys._getframe(1).f_locals["result_queue"]
+    with queue._wlock:
+        os.write(queue._writer.fileno(), struct.pack("!i", 1000) + b"begun")
+        os.kill(os.getpid(), signal.SIGKILL)
+
+if __name__ == "__main__":
+    try:
+        list(process_workers(halfway, 2).results(range(6)))
+    except ProductError as error:
+        print(error)
+"""
 _DRIVER = """
 import os, signal, time
 from pachon.core.workers import process_workers
@@ -63,3 +83,13 @@ def test_an_interrupt_does_not_wait_for_jobs_under_way(tmp_path):
             driver.kill()
     assert "KeyboardInterrupt" in said
     assert not lives(worker)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(os.name != "posix", reason="kills a process")
+def test_a_worker_that_is_killed_halfway_through_a_result_is_one_clear_line(tmp_path):
+    # The pool waited for the rest of the result, and the other worker for the lock, without end.
+    (tmp_path / "driver.py").write_text(_HALFWAY)
+    said = subprocess.run([sys.executable, "driver.py"], cwd=tmp_path, capture_output=True, text=True, timeout=30.0,
+                          env={**os.environ, "PYTHONPATH": os.getcwd()}, check=True)  # fmt: skip
+    assert said.stdout.startswith("a worker process died, killed or short of memory")
