@@ -82,28 +82,13 @@ def image_jacobians(
     telescope: Telescope, directions: np.ndarray, wavelength: float, threads: int | None = None
 ) -> np.ndarray:
     """Return d(position on the detector)/d(direction cosines) [m], shape [n, 2, 2], by central differences."""
-    return chief_ray_derivatives(telescope, directions, wavelength, threads)[0]
-
-
-def chief_ray_derivatives(
-    telescope: Telescope, directions: np.ndarray, wavelength: float, threads: int | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of positions [m] and direction cosines of chief rays at the image, both [n, 2, 2].
-
-    They are those along x and y of the detector by the direction cosines of the incoming light.
-    """
     steps = JACOBIAN_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     # One trace for all four neighbours: with few rays the launch of the kernel takes most of the time.
     cosines = (directions[:, :2] + steps[:, None]).reshape(-1, 2)
     end = chief_rays(telescope, _downward_directions(cosines), wavelength, threads=threads)
-    detector = telescope.surfaces[-1]
-
-    def by_cosines(values: np.ndarray) -> np.ndarray:
-        forward, backward = np.moveaxis(values[:, :2].reshape(2, 2, -1, 2), 1, 0)
-        return np.moveaxis((forward - backward) / (2 * JACOBIAN_STEP), 0, -1)
-
-    places = detector.to_local(image_points(telescope, end))
-    return by_cosines(places), by_cosines(detector.along(end.direction))
+    place = telescope.surfaces[-1].to_local(image_points(telescope, end))[:, :2]
+    forward, backward = np.moveaxis(place.reshape(2, 2, -1, 2), 1, 0)
+    return np.moveaxis((forward - backward) / (2 * JACOBIAN_STEP), 0, -1)
 
 
 @check_arguments

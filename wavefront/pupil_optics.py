@@ -25,7 +25,8 @@ from ..raytrace.pack.surfaces import indices_and_wavelength, pack_surfaces
 from ..raytrace.rays import Projection, RayStatus, require_distant_object
 from ..raytrace.trace import trace
 from .aberration import ResidualWavefront
-from .chief_rays import chief_ray_derivatives, reference_rays
+from .chief_rays import image_jacobians, reference_rays
+from .exit_pupil_path import ExitPupil
 from .pupil_sampling import CHIEF_RAY
 from .reference_sphere import path_to_sphere
 from .request import Request
@@ -34,10 +35,9 @@ from .request import Request
 _OF_STARS = (
     "displacement",
     "path",
-    "by_aberration",
     "lit",
+    "exit_pupil_path",
     "jacobian",
-    "exit_jacobian",
     "reference_points",
     "reference_cosines",
     "fields",
@@ -55,14 +55,14 @@ class PupilOptics:
     pupil: np.ndarray  #: [n_pupil, 2] m, entrance-pupil coordinates
     #: [n_star, n_wave, n_pupil, 2] m, float32: landing point on the CCD minus reference point, x and y of the detector
     displacement: np.ndarray
-    by_aberration: np.ndarray  #: [n_star, n_pupil, 2] m: part of it by an added aberration
     #: [n_star, n_wave, n_pupil] m: path to the reference sphere minus that of the chief ray, the negative of the OPD
     path: np.ndarray
+    #: [n_star, n_wave, n_pupil] m: path to spheres through the exit pupil minus that of the chief ray, where it is
+    #: wanted. Its gradient along the pupil is the inverse of the Jacobian times the displacement, out of focus too:
+    #: waves of this phase land where rays do.
+    exit_pupil_path: np.ndarray
     lit: np.ndarray  #: [n_star, n_wave, n_pupil] bool
     jacobian: np.ndarray  #: [n_star, 2, 2] m/rad: detector position by direction cosines of the incoming light
-    #: [n_star, 2, 2]: direction cosines of chief rays at the image, times the index there, by those of incoming light
-    exit_jacobian: np.ndarray
-    sphere_curvature: float  #: of the reference spheres, times that index [1/m]
     reference_points: np.ndarray  #: [n_star, 3] m, telescope frame
     reference_cosines: np.ndarray  #: [n_star, 2] direction cosines of the chief rays along x and y of the detector
     fields: np.ndarray  #: [n_star, 2] rad
@@ -84,20 +84,6 @@ class PupilOptics:
         return replace(parts[0], **arrays)
 
     @property
-    def exit_pupil_path(self) -> np.ndarray:
-        """Path to spheres through the exit pupil minus that of the chief ray [m], shape of `path`.
-
-        Its gradient along the pupil is the inverse of the Jacobian times the displacement, out of focus too: waves of
-        this phase land where rays do. On another sphere the image has another scale, in proportion to the defocus.
-        """
-        # Curvature of the reference sphere beyond that of the sphere through the exit pupil.
-        excess = self.exit_jacobian @ np.linalg.inv(self.jacobian) + self.sphere_curvature * np.eye(2)
-        # An added aberration is one of the path to these spheres already.
-        landing = self.displacement.astype(np.float64) - self.by_aberration[:, None]
-        squares = np.einsum("swpi,sij,swpj->swp", landing, excess, landing)
-        return np.asarray(self.path + 0.5 * squares)
-
-    @property
     def exit_cosines(self) -> np.ndarray:
         """Direction cosines of the light at the image along x and y of the detector, shape [n_star, n_pupil, 2].
 
@@ -117,6 +103,7 @@ def trace_pupils(
     vignetting: np.ndarray | None = None,
     projection: Projection = "zemax",
     threads: int | None = None,
+    exit_pupil: bool = False,
 ) -> PupilOptics:
     """Trace the same pupil points for many stars at several wavelengths to the CCD of each star.
 
@@ -203,26 +190,26 @@ def trace_pupils(
     offset = np.stack([x, y], axis=-1)
     path = traced_path - chief_path[:, :, None]
     index = float(light[request.middle_index, -3])
-    jacobian, turn = chief_ray_derivatives(telescope, direction, request.middle, threads)
-    by_aberration = np.broadcast_to(0.0, (n_star, n_pupil, 2))
+    jacobian = image_jacobians(telescope, direction, request.middle, threads)
+    exit_pupil_path = np.broadcast_to(np.nan, path.shape)
+    if exit_pupil:
+        exit_pupil_path = ExitPupil(request, index, chief, slopes, jacobian).path(pupil, path, offset)
     if aberration is not None:
         # The path is minus the OPD; light is displaced by the Jacobian times the gradient of the path, as by a screen.
         x, y = pupil.T
-        path -= aberration.opd(x, y, request.slopes)[:, None]
-        along_x, along_y = np.moveaxis(aberration.gradient(x, y, request.slopes), -1, 0)
-        by_aberration = np.empty((n_star, n_pupil, 2))
-        for axis in range(2):
-            by_aberration[..., axis] = -(jacobian[:, axis, 0, None] * along_x + jacobian[:, axis, 1, None] * along_y)
-        offset += by_aberration[:, None]
+        opd = aberration.opd(x, y, request.slopes)[:, None]
+        path -= opd
+        if exit_pupil:
+            exit_pupil_path -= opd
+        gradient = aberration.gradient(x, y, request.slopes)
+        offset -= np.einsum("sij,spj->spi", jacobian, gradient)[:, None]
     return PupilOptics(
         pupil=pupil,
         displacement=offset.astype(np.float32),
-        by_aberration=by_aberration,
         path=path,
+        exit_pupil_path=exit_pupil_path,
         lit=status == RayStatus.OK,
         jacobian=jacobian,
-        exit_jacobian=index * turn,
-        sphere_curvature=index / radius,
         reference_points=reference_points,
         reference_cosines=(chief.direction @ rotation)[:, :2],
         fields=request.fields,

@@ -85,12 +85,10 @@ class PolynomialPupil:
         return PupilOptics(
             pupil=np.asarray(pupil),
             displacement=same(landing.astype(np.float32)),
-            by_aberration=np.zeros((len(fields), len(x), 2)),
             path=same(path),
+            exit_pupil_path=same(path),
             lit=np.broadcast_to(lit, (len(fields), len(wavelengths), len(x))).copy(),
             jacobian=np.broadcast_to(jacobian, (len(fields), 2, 2)).copy(),
-            exit_jacobian=np.zeros((len(fields), 2, 2)),
-            sphere_curvature=0.0,
             reference_points=np.zeros((len(fields), 3)),
             reference_cosines=np.tile(self.cosines, (len(fields), 1)),
             fields=fields,

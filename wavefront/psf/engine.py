@@ -192,7 +192,13 @@ class PsfRenderer(ABC):
         return RenderedStars(image, stars.lit_fraction, stars.reference_point, offsets - shift, first)
 
     def _trace(
-        self, fields: np.ndarray, pupil: np.ndarray, threads: int | None, wavelengths: np.ndarray | None = None
+        self,
+        fields: np.ndarray,
+        pupil: np.ndarray,
+        threads: int | None,
+        wavelengths: np.ndarray | None = None,
+        *,
+        exit_pupil: bool = False,
     ) -> PupilOptics:
         inputs = self._inputs
         optics = inputs.trace(
@@ -204,6 +210,7 @@ class PsfRenderer(ABC):
             projection=inputs.projection,
             threads=threads,
             aberration=inputs.aberration,
+            exit_pupil=exit_pupil,
         )
         check_stamp(optics, inputs.plane)
         return optics

@@ -124,12 +124,10 @@ class FieldOptics:
         return PupilOptics(
             pupil=self.pupil,
             displacement=displacement,
-            by_aberration=np.broadcast_to(np.nan, (n_star, n_pupil, 2)),
             path=np.broadcast_to(np.nan, (n_star, n_wave, n_pupil)),
+            exit_pupil_path=np.broadcast_to(np.nan, (n_star, n_wave, n_pupil)),
             lit=np.repeat(self._lit(edges)[:, None], n_wave, axis=1),
             jacobian=jacobian,
-            exit_jacobian=np.broadcast_to(np.nan, jacobian.shape),
-            sphere_curvature=np.nan,
             reference_points=self.telescope.surfaces[-1].to_telescope(reference),
             reference_cosines=self._cosines(chief)[:, :2],
             fields=fields,

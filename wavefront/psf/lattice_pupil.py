@@ -152,12 +152,11 @@ class LatticeTransfer:
         if not lit.size:
             return out
         pupil, displacement = star_optics.pupil[lit], star_optics.displacement[:, :, lit]
-        by_aberration = star_optics.by_aberration[:, lit]
-        star_optics = replace(star_optics, pupil=pupil, displacement=displacement, by_aberration=by_aberration)
-        path = star_optics.path[:, :, lit]
+        star_optics = replace(star_optics, pupil=pupil, displacement=displacement)
+        path = star_optics.exit_pupil_path[:, :, lit]
         if len(self.wavelengths) > 1:
             path = path + np.einsum("wt,pt->wp", rays.path[star], self._terms(pupil, _DEGREE))
-        path = channels.path(replace(star_optics, path=path))[0]
+        path = channels.path(replace(star_optics, exit_pupil_path=path))[0]
         mean = displacement[0, 0].mean(axis=0, dtype=np.float64) + rays.shift[star][channels.wave]
         if channels.shift.any():
             mean += channels.shift[:, None] * star_optics.exit_cosines[0].mean(axis=0)

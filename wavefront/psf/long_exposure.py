@@ -348,7 +348,10 @@ class LongExposureRenderer(PsfRenderer):
             )
 
     def _lattice_rays(self, lattice: LatticeTransfer, stars: Stars) -> LatticeRays:
-        return lattice.trace(lambda wavelengths, points: self._trace(stars.fields, points, self._threads, wavelengths))
+        def traced(wavelengths: np.ndarray, points: np.ndarray) -> PupilOptics:
+            return self._trace(stars.fields, points, self._threads, wavelengths, exit_pupil=True)
+
+        return lattice.trace(traced)
 
     def _expose_autocorrelation(self, parts: Iterable[tuple[LatticeTransfer, LatticeRays, Stars]]) -> ExposedStars:
         """Expose stars by the autocorrelation of their lattices, batch by batch."""

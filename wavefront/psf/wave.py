@@ -184,7 +184,7 @@ class WaveRenderer(PsfRenderer):
     def _expose_star(self, field: np.ndarray, photons: np.ndarray | None) -> tuple[PupilOptics, np.ndarray]:
         """Return the optics of a star and its spectra, the OTF times the transfer function of the detector."""
         points = self._lattice.points
-        optics = self._trace(field[None], points, 1)
+        optics = self._trace(field[None], points, 1, exit_pupil=True)
         optics = clipped_by_apertures(optics, points, 0.5 * self._diameter * self._obscuration)
         spectra = self._filtered(self._intensity(field, optics), optics.jacobian[0])
         if photons is not None and optics.lit.any():

@@ -46,7 +46,7 @@ def after_path(pupil, shift):
         return replace(
             optics,
             displacement=(optics.displacement + shift * cosines).astype(np.float32),
-            path=optics.path - 0.5 * shift * square,
+            exit_pupil_path=optics.exit_pupil_path - 0.5 * shift * square,
         )
 
     return traced
