@@ -8,7 +8,7 @@ ray is not there yet. Fourier optics takes :math:`-J^{-T} p` for u, and so needs
 
 .. math:: \nabla C = J^{-1} (x - x') - (\partial \delta / \partial p)^T x', \quad \delta = -u - J^{-T} p.
 
-In focus C is next to nothing, and where the exit pupil is an even image of the entrance pupil: at infinity, of a
+C is next to nothing in focus, and where the exit pupil is an even image of the entrance pupil: at infinity, of a
 telescope that obeys the sine condition. Donuts of others were up to 1.5 % too small.
 """
 
