@@ -87,7 +87,7 @@ class PupilOptics:
     def exit_cosines(self) -> np.ndarray:
         """Direction cosines of the light at the image along x and y of the detector, shape [n_star, n_pupil, 2].
 
-        From pupil coordinates and Jacobians, good to 1e-4 (:doc:`conventions`).
+        From pupil coordinates and Jacobians, good to 1e-4 under the sine condition (:doc:`conventions`).
         """
         return self.reference_cosines[:, None] - self.pupil @ np.linalg.inv(self.jacobian)
 
