@@ -41,9 +41,7 @@ class ExitPupil:
     index: float  #: refractive index at the image
     chief: TraceResult  #: chief rays at the reference points
     slopes: np.ndarray  #: of the CCDs there along x and y of the detector, [n_star, 2]
-    jacobian: (
-        np.ndarray
-    )  #: positions on the detector by direction cosines of the incoming light [m/rad], [n_star, 2, 2]
+    jacobian: np.ndarray  #: [n_star, 2, 2] m/rad: detector position by direction cosines of the incoming light
 
     def path(self, pupil: np.ndarray, path: np.ndarray, landing: np.ndarray) -> np.ndarray:
         """Return paths to spheres through the exit pupils less those of the chief rays [m].
