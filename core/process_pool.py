@@ -23,9 +23,17 @@ def first_done(
         done, waiting = wait(futures, timeout=_LOOK_SECONDS, return_when=FIRST_COMPLETED)
         if done:
             return done, waiting
-        processes = list((pool._processes or {}).values())
-        if connection.wait([process.sentinel for process in processes], timeout=0):
-            for process in processes:
-                process.terminate()
-            # With no other writer left the pool's thread reads the end of the pipe.
-            pool._result_queue._writer.close()  # type: ignore[attr-defined]
+        if connection.wait([process.sentinel for process in _processes(pool)], timeout=0):
+            end_processes(pool)
+
+
+def end_processes(pool: ProcessPoolExecutor) -> None:
+    """End the processes of a pool at once, whatever they do."""
+    for process in _processes(pool):
+        process.terminate()
+    # With no writer left the pool's thread does not wait for the rest of a result.
+    pool._result_queue._writer.close()  # type: ignore[attr-defined]
+
+
+def _processes(pool: ProcessPoolExecutor) -> list[Any]:
+    return list((pool._processes or {}).values())

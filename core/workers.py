@@ -22,7 +22,7 @@ from typing import Any
 from .arguments import check_arguments
 from .errors import ProductError
 from .number_text import counted
-from .process_pool import first_done
+from .process_pool import end_processes, first_done
 from .threads import thread_count
 from .units import require_count
 
@@ -104,8 +104,7 @@ def process_workers(compute: Compute, count: int, threads: int | None = None) ->
                 ) from None
             except BaseException:
                 # Ctrl-C or an error: nobody will take the results of the jobs under way, which may take minutes.
-                for process in list(pool._processes.values()):
-                    process.terminate()
+                end_processes(pool)
                 raise
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)

@@ -21,13 +21,18 @@ def halfway(number, threads):
     queue = sys._getframe(1).f_locals["result_queue"]
     with queue._wlock:
         os.write(queue._writer.fileno(), struct.pack("!i", 1000) + b"begun")
-        os.kill(os.getpid(), signal.SIGKILL)
+        os.kill(ENDED, SIGNAL)
+        time.sleep(60.0)
+
+def interrupted(*_):
+    raise KeyboardInterrupt
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, interrupted)
     try:
         list(process_workers(halfway, 2).results(range(6)))
-    except ProductError as error:
-        print(error)
+    except (ProductError, KeyboardInterrupt) as error:
+        print(repr(error))
 """
 _DRIVER = """
 import os, signal, time
@@ -87,9 +92,16 @@ def test_an_interrupt_does_not_wait_for_jobs_under_way(tmp_path):
 
 @pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="kills a process")
-def test_a_worker_that_is_killed_halfway_through_a_result_is_one_clear_line(tmp_path):
-    # The pool waited for the rest of the result, and the other worker for the lock, without end.
-    (tmp_path / "driver.py").write_text(_HALFWAY)
-    said = subprocess.run([sys.executable, "driver.py"], cwd=tmp_path, capture_output=True, text=True, timeout=30.0,
-                          env={**os.environ, "PYTHONPATH": os.getcwd()}, check=True)  # fmt: skip
-    assert said.stdout.startswith("a worker process died, killed or short of memory")
+@pytest.mark.parametrize(
+    ("ended", "sent", "said"),
+    [
+        # The pool waited for the rest of the result, and the other worker for the lock, without end.
+        ("os.getpid()", "signal.SIGKILL", "ProductError('a worker process died, killed or short of memory"),
+        ("os.getppid()", "signal.SIGINT", "KeyboardInterrupt()"),
+    ],
+)
+def test_work_ends_that_stops_halfway_through_a_result(ended, sent, said, tmp_path):
+    (tmp_path / "driver.py").write_text(_HALFWAY.replace("ENDED", ended).replace("SIGNAL", sent))
+    driver = subprocess.run([sys.executable, "driver.py"], cwd=tmp_path, capture_output=True, text=True, timeout=30.0,
+                            env={**os.environ, "PYTHONPATH": os.getcwd()}, check=True)  # fmt: skip
+    assert driver.stdout.startswith(said)
