@@ -233,11 +233,17 @@ def prior_spreads(
     """
     if prior is None:
         rms = sensitivity(telescope, freedoms, wavelength=wavelength).rms
-        if (silent := rms < _SILENT * freedoms.unit_sizes).any():
-            names = ", ".join(np.array(freedoms.names)[silent])
-            raise DomainError(f"{names}: no change of the wavefront; expected other freedoms, or their prior")
+        if names := silent_names(freedoms, rms):
+            raise DomainError(
+                f"{', '.join(names)}: no change of the wavefront; expected other freedoms, or their prior"
+            )
         return np.asarray(DEFAULT_PRIOR / rms)
     return stated_spreads(freedoms, prior)
+
+
+def silent_names(freedoms: DegreesOfFreedom, rms: np.ndarray) -> list[str]:
+    """Return the names of degrees of freedom that change no wavefront, by its rms [m] per unit of each, shape [n]."""
+    return [name for name, none in zip(freedoms.names, rms < _SILENT * freedoms.unit_sizes, strict=True) if none]
 
 
 def stated_spreads(

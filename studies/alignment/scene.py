@@ -14,6 +14,7 @@ from ...models.io.prescription import ENDINGS, load_telescope, prescription_dige
 from ...models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...models.parameters.degrees_of_freedom_file import load_degrees_of_freedom
 from ...models.telescope import Telescope
+from ...sensing.degrees import silent_names
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
 from ...wavefront.atmosphere.screen_sampling import ScreenSampling
@@ -114,10 +115,15 @@ class AlignmentScene:
     def tolerances(self) -> np.ndarray:
         """Tolerances, each in its unit, shape [n]."""
         errors = self.config.errors
-        sizes = 1e-9 * errors.tolerance_nm / np.sqrt((self.field_response**2).sum(axis=0))
-        for name, value in errors.tolerances.items():
-            sizes[self.freedoms.index(name)] = value
-        return np.asarray(sizes)
+        rms = np.sqrt((self.field_response**2).sum(axis=0))
+        stated = self.freedoms.vector(errors.tolerances)
+        silent = [name for name in silent_names(self.freedoms, rms) if name not in errors.tolerances]
+        if silent:
+            raise ConfigError(
+                f"errors.tolerances: expected those of {', '.join(silent)}, which change no wavefront",
+                key="errors.tolerances",
+            )
+        return np.where(stated > 0.0, stated, 1e-9 * errors.tolerance_nm / np.where(stated > 0.0, 1.0, rms))
 
     @cached_property
     def steps(self) -> np.ndarray:

@@ -212,6 +212,19 @@ def test_bad_files_of_states_are_one_line(tmp_path):
         Experiment.from_config(run, tmp_path)
 
 
+def test_freedoms_without_effect_on_the_wavefront_need_a_tolerance(tmp_path):
+    path = tmp_path / "hexapod.yaml"
+    members = ("{name: M2_dz, unit: um, of: M2.dz}", "{name: M2_rz, unit: arcsec, of: M2.rz}")
+    path.write_text("name: hexapod\ndegrees_of_freedom:\n" + "".join(f"  - {member}\n" for member in members))
+    config = AlignConfig(degrees_of_freedom=str(path))
+    with pytest.raises(ConfigError, match=r"errors\.tolerances: expected those of M2_rz, which change no wavefront"):
+        _ = AlignmentScene.of(config).tolerances
+    stated = config.model_copy(update={"errors": config.errors.model_copy(update={"tolerances": {"M2_rz": 100.0}})})
+    sizes = AlignmentScene.of(stated).tolerances
+    assert sizes[1] == 100.0
+    assert 1.0 < sizes[0] < 10.0
+
+
 @pytest.mark.slow
 def test_the_command_shows_the_loop(traced_donuts, tmp_path, capsys):
     (tmp_path / "loop.yaml").write_text("air: {wavefront: false}\nvisits: 9\n")
