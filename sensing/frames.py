@@ -42,7 +42,7 @@ FRAMES: tuple[FrameName, ...] = get_args(FrameName)
 _NAMED_AXES = {"CCS": "x,y", "DVCS": "y,x"}
 #: Unit vectors along the axes of the camera that stamps may run along.
 _AXES = {"x": (1.0, 0.0), "y": (0.0, 1.0), "-x": (-1.0, 0.0), "-y": (0.0, -1.0)}
-#: Coupling of two Zernike terms below which it is rounding of a quarter turn.
+#: Cosine, sine or coupling of two Zernike terms below which it is rounding of a quarter turn.
 _ROUNDING = 1e-12
 #: Half a turn about y.
 _ZCS = np.diag([-1.0, 1.0, -1.0])
@@ -250,7 +250,8 @@ def zernike_matrix(noll: Sequence[int] | np.ndarray, axes: np.ndarray) -> np.nda
 
 def _turned(angle: float) -> np.ndarray:
     """Return axes turned by an angle from +x towards +y [rad], one a row."""
-    cosine, sine = np.cos(angle), np.sin(angle)
+    # Of quarter turns exactly zero: motions that are not fitted would have errors that are not.
+    cosine, sine = (0.0 if abs(value) < _ROUNDING else value for value in (np.cos(angle), np.sin(angle)))
     return np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 

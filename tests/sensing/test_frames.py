@@ -261,6 +261,8 @@ def test_corrections_undo_the_motions_in_every_frame(focused):
     )
     # Camera's x lies along the telescope's y, its y along -x.
     np.testing.assert_allclose(turned.shift[0], [-20.0, 10.0, -30.0], atol=1e-9)
+    # What was not fitted has no error, nor one of rounding.
+    assert turned.shift_error[1, 0] == turned.tilt_error[1, 0] == 0.0
 
 
 @pytest.mark.parametrize(
