@@ -132,9 +132,11 @@ def quality_picture(alignment: Alignment) -> bytes:
         for axes, (label, values) in zip(panel_axes, panels, strict=True):
             axes.plot(visit, values, "o-", color=BLUE, markersize=3.0, linewidth=0.8, label="telescope")
             axes.set_ylabel(label)
-        for axes in panel_axes[[0, 2]]:
-            axes.set_yscale("log")
-            label_log_axis(axes.yaxis)
+        for axes, values in ((panel_axes[0], panels[0][1]), (panel_axes[2], panels[2][1])):
+            # A telescope without errors adds nothing, and zeros have no logarithm.
+            if max(values) > 0.0:
+                axes.set_yscale("log")
+                label_log_axis(axes.yaxis)
         panel_axes[0].plot(visit, 1e9 * alignment.expected, color=ORANGE, label="expected from the covariance")
         panel_axes[0].axhline(1e9 * alignment.floor, color=GREY, linewidth=0.8, linestyle="--", label="floor")
         panel_axes[1].set_yscale("symlog", linthresh=10.0)

@@ -1,6 +1,7 @@
 """The active-optics loop: convergence, honesty of what it expects, heights, bytes, files."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,8 +17,9 @@ from pachon.pipeline.config_hash import hashed_states
 from pachon.pipeline.experiment import Experiment
 from pachon.studies.alignment import loop
 from pachon.studies.alignment.config import AlignConfig, load_align_configuration
+from pachon.studies.alignment.field_quality import FieldMeans
 from pachon.studies.alignment.loop import align
-from pachon.studies.alignment.product import write_alignment
+from pachon.studies.alignment.product import quality_picture, write_alignment
 from pachon.studies.alignment.scene import AlignmentScene
 from pachon.studies.alignment.store import VisitStore
 
@@ -210,6 +212,13 @@ def test_bad_files_of_states_are_one_line(tmp_path):
     QTable({"visit": [0], "M2_dw": [1.0]}).write(tmp_path / "states.ecsv", overwrite=True)
     with pytest.raises(UnknownNameError, match="M2_dw"):
         Experiment.from_config(run, tmp_path)
+
+
+def test_a_telescope_without_errors_is_drawn():
+    """Nothing is added, which has no logarithm: warnings are errors of tests."""
+    quality = FieldMeans(wavefront=1.4e-7, added=0.0, fwhm=0.56, rms_g=0.005, size=0.13, rms_e=0.002)
+    scene = SimpleNamespace(designed=quality, visits=(quality, quality), expected=np.zeros(2), floor=0.0)
+    assert quality_picture(scene).startswith(b"\x89PNG")
 
 
 def test_freedoms_without_effect_on_the_wavefront_need_a_tolerance(tmp_path):
