@@ -398,13 +398,32 @@ def _fit(
         coefficients[i], _, _, size = np.linalg.lstsq(
             terms[lit] * root[lit, None], value[i, lit] * root[lit], rcond=None
         )
-        if size[-1] < _SEPARATED * size[0]:
-            raise DomainError(
-                f"{field_label(fields[i])}: light passes at {100.0 * weights[lit].sum() / weights.sum():.2g} % of the "
-                f"pupil, where jmax = {jmax} terms cannot be told apart; expected fewer"
-            )
+        require_separated(size[-1] / size[0], f"jmax = {jmax}", fields[i], weights[lit].sum() / weights.sum())
     residual = np.where(used, value - coefficients @ terms.T, 0.0)
     return coefficients, np.sqrt((residual**2 @ weights) / (used @ weights))
+
+
+def require_separated(ratio: float, terms: str, field: np.ndarray, lit: float, *, least: float = _SEPARATED) -> None:
+    """Raise DomainError where the lit pupil cannot tell terms apart.
+
+    Parameters
+    ----------
+    ratio : float
+        Least over greatest singular value of the terms at the lit points.
+    terms : str
+        Key and number of the terms.
+    field : ndarray, shape [2]
+        Field angles [rad].
+    lit : float
+        Fraction of the pupil where light passes.
+    least : float
+        Least ratio of terms that are told apart.
+    """
+    if not ratio >= least:
+        raise DomainError(
+            f"{field_label(field)}: light passes at {100.0 * lit:.2g} % of the pupil, where {terms} terms cannot be "
+            "told apart; expected fewer"
+        )
 
 
 def term_label(j: int, ordering: ZernikeOrdering = "noll") -> str:

@@ -209,6 +209,22 @@ def test_fields_and_quantities(lsst_r):
     assert np.array_equal(one.matrix, two.matrix)
 
 
+def test_many_terms_have_points_enough(lsst_r):
+    """Terms of a lit annulus are orthogonal: more of them leave the first as they are, and are small."""
+    field = [[0.0, 0.0]]
+    few, many = (sensitivity(lsst_r, ["M1.Z22"], field, n_zernike=n).matrix[0, :, 0] for n in (28, 400))
+    np.testing.assert_allclose(many[:28], few, atol=1e-9 * np.abs(few).max())
+    # 1.06e-4, as by 40 rings; 12 made it 120.
+    assert np.abs(many[28:]).max() < 2e-4 * np.abs(few).max()
+
+
+def test_terms_that_vignetted_light_cannot_tell_apart_are_refused():
+    """Derivatives of Z4 to Z22 were 40 times too large for 200 terms."""
+    hsc = pachon.load_telescope("hsc")
+    with pytest.raises(DomainError, match=r"light passes at 6. % of the pupil, where n_zernike = 150 terms"):
+        sensitivity(hsc, ["CAM.dz"], np.deg2rad([[0.0, 0.7125]]), n_zernike=150)
+
+
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
