@@ -26,6 +26,7 @@ from ...wavefront.pupil_optics import trace_pupils
 from ...wavefront.pupil_sampling import PupilSampling, SamplingName, gauss_annulus
 from ...wavefront.reference_sphere import require_met
 from ...wavefront.request import Request, field_points
+from ...wavefront.zernike import SEPARATED
 from ..drawing import FEW, draw_field_map, field_colors, panels_of, spread_in_field
 from ..result import FieldResult
 
@@ -38,9 +39,6 @@ FittedPupil = Literal["full", "lit"]
 #: The same, or whichever has a smooth wavefront.
 PupilToFit = Literal["auto", "full", "lit"]
 ZernikeOrdering = Literal["noll", "fringe"]
-#: Least over greatest singular value of terms that points tell apart: where 4 % of HSC's pupil are lit, 28 terms have
-#: 3e-11, and coefficients of 10 cm.
-_SEPARATED = 1e-5
 #: Maps of single terms in one plot.
 _MAPS = 8
 #: Terms by which it is found whether the wavefront of the whole annulus is one of Zernikes.
@@ -403,7 +401,7 @@ def _fit(
     return coefficients, np.sqrt((residual**2 @ weights) / (used @ weights))
 
 
-def require_separated(ratio: float, terms: str, field: np.ndarray, lit: float, *, least: float = _SEPARATED) -> None:
+def require_separated(ratio: float, terms: str, field: np.ndarray, lit: float, *, least: float = SEPARATED) -> None:
     """Raise DomainError where the lit pupil cannot tell terms apart.
 
     Parameters

@@ -130,6 +130,13 @@ def test_too_few_points(lsst_r):
         fit_zernikes(opd, 4.18, EPS, jmax=28)
 
 
+def test_terms_that_vignetted_light_cannot_tell_apart_are_refused(lsst_r):
+    """78 terms of a third of the pupil had coefficients of 2 mm."""
+    opd = pachon.wavefront_opd(lsst_r, np.deg2rad([0.0, 2.0]), 620e-9, grid=64)
+    with pytest.raises(DomainError, match=r"jmax = 78: terms cannot be told apart at the \d+ lit points"):
+        fit_zernikes(opd, 4.18, EPS, jmax=78)
+
+
 def test_fits_of_a_map_are_those_of_galsim(lsst_r):
     galsim = pytest.importorskip("galsim")
     opd = pachon.wavefront_opd(lsst_r, np.deg2rad([0.7, 0.9]), 620e-9, grid=64)
