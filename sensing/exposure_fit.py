@@ -13,13 +13,12 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..design.metrics.field_zernikes import wavefront_zernikes
-from ..design.optimize.sensitivity import sensitivity
 from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ..models.parameters.tolerances import Tolerance
 from ..models.telescope import Telescope
 from ..wavefront.atmosphere.atmosphere import Atmosphere
 from .contradicting_donuts import Consistent, fit_consistently, without
-from .degrees import FreedomEstimate, prior_spreads, stated_spreads
+from .degrees import FreedomEstimate, annulus_response, prior_spreads, stated_spreads
 from .exposure import ExposureWavefront
 from .fit_star import StarFit
 from .hierarchy import Basis, ExposureAir, Observations, fit_hierarchy, star_numbers
@@ -213,10 +212,8 @@ class ExposureDonuts(WavefrontFit):
         believed, made = None, np.zeros_like(observations.zernikes)
         for _ in range(2):
             state = freedoms.apply(telescope, values)
-            response = sensitivity(
-                state, freedoms, fields=fields, wavelength=wavelength, n_zernike=last, projection=usable.projection
-            )
-            columns = response.matrix[:, noll - 1] * spreads
+            response = annulus_response(state, freedoms, fields, wavelength, last, usable.projection)
+            columns = response[:, noll - 1] * spreads
             coefficients = wavefront_zernikes(
                 state, fields, wavelength, jmax=last, pupil="full", projection=usable.projection
             ).coefficients

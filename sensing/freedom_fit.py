@@ -13,12 +13,11 @@ from scipy.linalg import block_diag
 
 from ..core.arguments import check_arguments
 from ..design.metrics.field_zernikes import wavefront_zernikes
-from ..design.optimize.sensitivity import sensitivity
 from ..models.parameters.degrees_of_freedom import DegreesOfFreedom
 from ..models.parameters.tolerances import Tolerance
 from ..raytrace.launch import aimed_points
 from ..wavefront.psf.pupil_rims import pupil_rims
-from .degrees import FreedomEstimate, FreedomRays, prior_spreads, stated_spreads
+from .degrees import FreedomEstimate, FreedomRays, annulus_response, prior_spreads, stated_spreads
 from .fit_star import StarFit
 from .inputs import noll_indices
 from .joint_errors import joint_errors
@@ -47,8 +46,6 @@ _INNER = 6
 _SETTLED = 1e-3
 #: Step of the differences by which rims follow degrees of freedom, in units of the prior.
 _STEP = 1e-3
-#: Terms that are fitted at least over the whole annulus, vignetted or not: no other then shows up in those asked for.
-_MANY_TERMS = 37
 
 
 @check_arguments
@@ -95,13 +92,13 @@ class TelescopeFreedoms(WavefrontFit):
         spreads = prior_spreads(freedoms, self.prior, telescope, wavelength)
         fields, projection = usable.fields, usable.projection
         last = int(noll.max())
-        response = sensitivity(telescope, freedoms, fields, wavelength, n_zernike=last, projection=projection)
+        response = annulus_response(telescope, freedoms, fields, wavelength, last, projection)[:, noll - 1]
         count, slopes = len(freedoms), instrument.slope_spreads
         first = count + len(slopes)
         shifts = self._rim_shifts(usable, spreads)
         maps = [block_diag(np.concatenate([np.eye(count), of_star]), np.eye(len(slopes))) for of_star in shifts]
         precision = np.concatenate([spreads, slopes]) ** -2.0
-        shared, unknowns = usable.start(response.matrix[:, noll - 1], spreads**-2.0), usable.unknowns
+        shared, unknowns = usable.start(response, spreads**-2.0), usable.unknowns
         shared = np.append(shared, 0.0 * slopes)
 
         def fitted(rims: FreeRims) -> JointFit:
@@ -124,7 +121,7 @@ class TelescopeFreedoms(WavefrontFit):
 
         fit = least_rims(shared_rims(instrument, usable.stars), fitted)
         stars, group, joint, rims = fit
-        errors = joint_errors(instrument, usable.stars, fields, response.matrix[:, noll - 1], stars, group, joint)
+        errors = joint_errors(instrument, usable.stars, fields, response, stars, group, joint)
         values = joint.shared[:count]
         after = freedoms.apply(telescope, values)
         believed, estimated = (
@@ -133,10 +130,9 @@ class TelescopeFreedoms(WavefrontFit):
             ]
             for t in (telescope, after)
         )
-        many = max(last, _MANY_TERMS)
-        response = sensitivity(after, freedoms, fields, wavelength, n_zernike=many, projection=projection)
+        response = annulus_response(after, freedoms, fields, wavelength, last, projection)[:, noll - 1]
         # Rims and slopes of the response are no part of the wavefront.
-        zernike_maps = np.pad(response.matrix[:, noll - 1], ((0, 0), (0, 0), (0, len(slopes) + len(rims))))
+        zernike_maps = np.pad(response, ((0, 0), (0, 0), (0, len(slopes) + len(rims))))
         covariance = (joint.shared_covariance + errors.shared)[:count, :count]
         moved = moved_rims_of_all(instrument, fit, first)
         return FittedStars(
