@@ -23,6 +23,8 @@ _WAVELENGTHS = 5
 _MANY = 9
 #: Shifts below are none [um].
 _LEAST_UM = 0.5
+#: Cosine of the normal of the detector and an axis of the telescope below which shifts have no part along it.
+_LEAST_PART = 1e-3
 
 
 def refocus(
@@ -34,8 +36,9 @@ def refocus(
 ) -> dict[str, float]:
     """Return the change of a prescription that brings light of another band into focus, by its key.
 
-    The detector moves to where spots are smallest on all CCDs, by no more than this height differs from that of the
-    light of the prescription: mirrors stay as they are. So does a detector that changes move along the axis already.
+    The detector moves along its normal to where spots are smallest on all CCDs, by no more than this height differs
+    from that of the light of the prescription: mirrors stay as they are. So does a detector that changes move along it
+    already.
 
     Parameters
     ----------
@@ -46,15 +49,19 @@ def refocus(
     changes : mapping
         Changes of the prescription: ``{"Detector.dz_um": 10.0}``.
     """
-    detector = telescope.surfaces[-1].name
+    detector, normal = telescope.surfaces[-1].name, np.array(telescope.surfaces[-1].rotation)[:, 2]
+    # Shifts are along the axes of the telescope; behind a folding mirror the normal is none of its z axis.
+    axes = {f"d{axis}": float(part) for axis, part in zip("xyz", normal, strict=True) if abs(part) > _LEAST_PART}
     for key in changes:
         moved, _, motion = key.rpartition(".")
-        if motion.startswith("dz") and detector in (moved, *telescope.groups.get(moved, ())):
+        if motion[:2] in axes and detector in (moved, *telescope.groups.get(moved, ())):
             return {}
     best, before = (_best_focus(telescope, camera, light) for light in (band, prescribed))
     nearest, farthest = sorted((0.0, best - before))
     shift = round(1e6 * float(np.clip(best, nearest, farthest)), 1)
-    return {f"{detector}.dz_um": shift} if math.isfinite(shift) and abs(shift) > _LEAST_UM else {}
+    if not (math.isfinite(shift) and abs(shift) > _LEAST_UM):
+        return {}
+    return {f"{detector}.{axis}_um": round(shift * part, 3) for axis, part in axes.items()}
 
 
 @lru_cache(maxsize=16)

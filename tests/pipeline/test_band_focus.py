@@ -41,3 +41,17 @@ def test_a_detector_that_changes_move_stays_there():
         assert resolved("decam", band="z", changes=changes).config.changes == changes
     moved = resolved("decam", band="z", changes={"PM.dz_um": 5.0}).config.changes
     assert set(moved) == {"PM.dz_um", "Detector.dz_um"}
+
+
+def test_a_detector_behind_a_fold_moves_along_its_normal():
+    # A shift along z of the telescope moves AuxTel's detector sideways and leaves its spots as they are.
+    experiment = resolved("auxtel", band="y")
+    assert list(experiment.config.changes) == ["Detector.dy_um"]
+    before, after = (
+        pachon.spots(model, np.deg2rad([[0.0, 0.05]]), experiment.wavelengths).rms_radius[0] * 1e6
+        for model in (pachon.load_telescope("auxtel"), experiment.telescope)
+    )
+    assert before > 9.3
+    assert after < 7.7
+    moved = {"Detector.dy_um": 1.0}
+    assert resolved("auxtel", band="y", changes=moved).config.changes == moved

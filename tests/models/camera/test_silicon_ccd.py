@@ -57,6 +57,15 @@ def test_quantities_are_lengths():
     )
 
 
+def test_the_surface_stands_in_front_of_the_focus_behind_a_fold():
+    # AuxTel's detector looks sideways: the sign was that of the light along z of the telescope, which it has by chance.
+    silicon = Silicon()
+    cosine = math.cos(0.5 / 18.0)
+    assert focus_height(load_telescope("auxtel"), silicon, 970e-9) == pytest.approx(
+        -silicon.defocus(970e-9)[0] * cosine, rel=1e-3
+    )
+
+
 def test_charge_spreads_with_the_root_of_the_distance_drifted():
     silicon = Silicon(thickness=100e-6)
     spread = silicon.diffusion(np.array([0.0, 36e-6, 75e-6, 100e-6]), 4e-6)
