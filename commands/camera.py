@@ -43,6 +43,15 @@ def camera_command(
             kind=Argument,
         ),
     ] = "lsstcam",
+    of_camera: Annotated[
+        str | None,
+        names(
+            completion.either(completion.cameras, completion.files(*completion.YAML)),
+            "--camera",
+            metavar="CAMERA",
+            help="Camera, or camera file, whose heights a file has; lsst by default.",
+        ),
+    ] = None,
     settings: Settings = None,
     picture: Picture = None,
     no_picture: NoPicture = False,
@@ -59,11 +68,13 @@ def camera_command(
     - `pachon camera my_camera.yaml --json`
     - `pachon camera`: heights of LSSTCam as built
     - `pachon camera metrology.fits --picture heights.pdf`
+    - `pachon camera my_metrology.ecsv --camera my_camera.yaml`: heights of another camera than the LSST
     - `pachon camera pachon_run/config.yaml --json`
     - `pachon camera pachon_run/config.yaml --set focal_plane.ccd=false`: without heights of single CCDs
     """
     from ..core.files import write_bytes
     from ..core.plotting import picture_bytes
+    from ..models.io.heights.file import ENDINGS
 
     kind = picture_kind(picture, no_picture)
     drawn = not no_picture and (picture is not None or not as_json)
@@ -72,7 +83,9 @@ def camera_command(
         raise ConfigError(f"--set: expected a configuration in place of {heights}, whose keys it sets")
     if settings and camera is not None:
         raise ConfigError(f"--set: expected a configuration, whose keys it sets; {heights} is a camera")
-    rows, content, draw = _listed(camera) if camera is not None else _heights(heights, settings or ())
+    if of_camera is not None and Path(heights).suffix.lower() not in ENDINGS:
+        raise ConfigError(f"--camera = {of_camera}: expected a file of heights in place of {heights}")
+    rows, content, draw = _listed(camera) if camera is not None else _heights(heights, of_camera, settings or ())
     name = file_name(camera.name if camera is not None else Path(heights).stem)
     files = {}
     if drawn:
@@ -120,7 +133,7 @@ def _listed(camera: Camera) -> _Content:
     return table, content, lambda: camera_plot(camera)
 
 
-def _heights(heights: str, settings: Sequence[str]) -> _Content:
+def _heights(heights: str, camera: str | None, settings: Sequence[str]) -> _Content:
     """Return the statistics of heights as a table and for JSON, and the function that draws a map."""
     from dataclasses import asdict
 
@@ -128,7 +141,7 @@ def _heights(heights: str, settings: Sequence[str]) -> _Content:
     from ..pipeline.report.height_plots import vendor_heights_plot
     from ..pipeline.report.tables import HEIGHT_CAPTION, HEIGHT_COLUMNS, height_rows
 
-    plane = _focal_plane(heights, settings)
+    plane = _focal_plane(heights, camera, settings)
     statistics = height_statistics(plane)
     residual = None if plane.residual is None else dict(zip(plane.names, plane.residual, strict=True))
     metrics = {name: asdict(group) for name, group in statistics.items()}
@@ -143,7 +156,7 @@ def _heights(heights: str, settings: Sequence[str]) -> _Content:
     return table, content, lambda: vendor_heights_plot(plane, title)
 
 
-def _focal_plane(heights: str, settings: Sequence[str]) -> FocalPlane:
+def _focal_plane(heights: str, camera: str | None, settings: Sequence[str]) -> FocalPlane:
     from ..core.errors import HeightWarning
     from ..models.camera.cameras import load_camera
     from ..pipeline.experiment import measured_focal_plane
@@ -151,4 +164,4 @@ def _focal_plane(heights: str, settings: Sequence[str]) -> FocalPlane:
     if Path(heights).suffix.lower() in YAML:
         return configured_experiment(Path(heights), settings).focal_plane
     with warnings_shown(HeightWarning):
-        return measured_focal_plane(heights, load_camera("lsst"))
+        return measured_focal_plane(heights, load_camera(camera or "lsst"))

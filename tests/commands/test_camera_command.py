@@ -40,6 +40,19 @@ def test_json_of_a_file_has_the_residuals_and_no_picture(tmp_path, monkeypatch, 
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mine.ecsv"]
 
 
+def test_heights_of_another_camera(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    plane = FocalPlane.from_budget("decam", seed=3)
+    plane.to_table(8).write("decam.ecsv")
+    # They were fitted to the CCDs of the LSST that lie there: 93 of 62, 51 um from peak to valley in place of 22.
+    assert main(["camera", "decam.ecsv", "--json"]) == 2
+    assert "column ccd, S1: expected names of lsst, such as R01_S00" in capsys.readouterr().err
+    assert main(["camera", "decam.ecsv", "--camera", "decam", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)["statistics_m"]["all"]
+    assert result["n_ccd"] == 62
+    assert result["rms"] == pytest.approx(height_statistics(plane)["all"].rms, rel=0.02)
+
+
 @pytest.mark.long
 def test_a_configuration_names_its_heights(tmp_path, capsys):
     path = tmp_path / "run.yaml"
@@ -55,6 +68,7 @@ def test_a_configuration_names_its_heights(tmp_path, capsys):
     ("arguments", "part"),
     [
         (["camera", "lsstcm"], "unknown camera 'lsstcm': did you mean lsstcam or lsst"),
+        (["camera", "hsc", "--camera", "decam"], "--camera = decam: expected a file of heights in place of hsc"),
         (["camera", "missing.fits"], "heights: missing.fits: no such file"),
         (["camera", "--picture", "heights.gif"], "expected a name that ends in .png, .pdf or .svg"),
     ],

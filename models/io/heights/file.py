@@ -69,7 +69,10 @@ def read_heights(path: str | Path, camera: Camera) -> MeasuredHeights:
                 heights = MeasuredHeights(surfaces, measured, np.full(len(camera), np.nan))
                 covered = _measured_fraction(heights, camera)
             else:
-                heights, covered = _fitted(_table_points(content, path), camera)
+                points = _table_points(content, path)
+                if "ccd" in content.colnames:
+                    _check_names(np.array([str(name).strip() for name in content["ccd"]]), points, camera)
+                heights, covered = _fitted(points, camera)
         else:
             # Names of FITS extensions are the same in capitals, in which astropy writes them.
             ccd_names = {name.upper(): name for name in camera.ccd_names}
@@ -78,7 +81,7 @@ def read_heights(path: str | Path, camera: Camera) -> MeasuredHeights:
                 first = ", ".join(list(content)[:3])
                 raise PrescriptionError(f"images {first}: expected names such as {camera.ccd_names[0]}", file=path)
             _warn_of_others(path, [name for name in content if name.upper() not in ccd_names])
-            _check_places(images, camera)
+            _check_places("image {}: has pixels", images, camera)
             heights, covered = _fitted(np.concatenate(list(images.values()), axis=1), camera)
     _warn(path, camera, heights, covered)
     return heights
@@ -139,14 +142,25 @@ def _measured_fraction(found: MeasuredHeights, camera: Camera) -> np.ndarray:
     return np.prod(np.diff(limits, axis=2)[..., 0] / (2.0 * half), axis=1)
 
 
-def _check_places(images: dict[str, np.ndarray], camera: Camera) -> None:
-    """Raise where the pixels of an image lie on another CCD than its name says."""
-    for name, (x, y, _) in images.items():
+def _check_names(ccds: np.ndarray, points: np.ndarray, camera: Camera) -> None:
+    """Raise where points [3, n] with names of CCDs [n] are those of another camera, or lie on others of its CCDs."""
+    by_name = {name: points[:, ccds == name] for name in camera.ccd_names if name in set(ccds)}
+    if not by_name and len(ccds):
+        raise PrescriptionError(
+            f"column ccd, {ccds[0]}: expected names of {camera.name}, such as {camera.ccd_names[0]}; are the heights of"
+            " another camera?"
+        )
+    _check_places("points of {}: some lie", by_name, camera)
+
+
+def _check_places(what: str, points: dict[str, np.ndarray], camera: Camera) -> None:
+    """Raise where points [3, n] by the name of their CCD lie on another one; ``what`` has a place for the name."""
+    for name, (x, y, _) in points.items():
         named_ccd = camera.ccd_index(name)
         elsewhere = (ccd := camera.ccd_at(x, y)) != named_ccd
         if np.any(elsewhere & (ccd >= 0)):
-            pixel_ccd = camera.ccd_names[int(ccd[elsewhere & (ccd >= 0)][0])]
-            raise PrescriptionError(f"image {name}: has pixels on {pixel_ccd}; are coordinates and frame right?")
+            other_ccd = camera.ccd_names[int(ccd[elsewhere & (ccd >= 0)][0])]
+            raise PrescriptionError(f"{what.format(name)} on {other_ccd}; are coordinates and frame right?")
 
 
 def _warn_of_others(path: Path, names: Sequence[str]) -> None:

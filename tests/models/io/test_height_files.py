@@ -333,3 +333,16 @@ def test_other_files_are_refused_in_one_line(tmp_path):
 def test_quantities_of_the_camera_as_built_do_not_depend_on_the_reader():
     assert pachon.FocalPlane.as_measured().height(0 * u.mm, 0 * u.mm) == FocalPlane.as_measured().height(0.0, 0.0)
     assert lsst_camera().name == FocalPlane.as_measured().camera.name
+
+
+def test_names_of_ccds_in_a_table_are_those_of_the_camera(tmp_path):
+    path = tmp_path / "named.ecsv"
+    for names, problem in (
+        (("B0", "B1"), "column ccd, B0: expected names of small, such as A_S00"),
+        (NAMES[::-1], "points of A_S00: some lie on A_S01; are coordinates and frame right?"),
+    ):
+        columns = dict(zip("xyz", points(4), strict=True))
+        table = Table({"ccd": np.repeat(names, 16), **columns}, units=dict.fromkeys("xyz", "m"))
+        table.write(path, overwrite=True)
+        with pytest.raises(PrescriptionError, match=problem):
+            FocalPlane.from_file(path, SMALL)
