@@ -17,7 +17,7 @@ from ..wavefront.chief_rays import fields_at
 
 #: Rings of rays across the pupil; each has six rays more than the one within.
 _RINGS = 6
-#: Wavelengths of a band.
+#: Wavelengths that stand for a band by default.
 _WAVELENGTHS = 5
 #: CCDs from which on their centres sample the field.
 _MANY = 9
@@ -25,6 +25,15 @@ _MANY = 9
 _LEAST_UM = 0.5
 #: Cosine of the normal of the detector and an axis of the telescope below which shifts have no part along it.
 _LEAST_PART = 1e-3
+
+
+def wavelengths_of_band(ends: tuple[float, float]) -> np.ndarray:
+    """Return the wavelengths that stand for a band by default [m]: the middles of equal parts of it.
+
+    From end to end they would have 1.5 times the variance of an even band, and the air would disperse them as much
+    more.
+    """
+    return np.linspace(*ends, 2 * _WAVELENGTHS + 1)[1::2]
 
 
 def refocus(
@@ -78,7 +87,7 @@ def _best_focus(telescope: Telescope, camera: Camera, band: tuple[float, float])
     rings = [(ring - 0.5) / _RINGS * np.stack([np.cos(a), np.sin(a)], axis=1) for ring, a in enumerate(angles, start=1)]
     pupil = 0.5 * telescope.pupil_diameter * np.concatenate(rings)
     shape, detector, total = (len(fields), len(pupil)), telescope.surfaces[-1], np.zeros(3)
-    for wavelength in np.linspace(*band, _WAVELENGTHS):
+    for wavelength in wavelengths_of_band(band):
         rays = parallel_rays(telescope, field_direction(*fields.T), float(wavelength), pupil)
         end = trace(telescope, rays)
         light = (end.status == RayStatus.OK).reshape(shape).astype(np.float64)

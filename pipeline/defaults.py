@@ -34,7 +34,7 @@ from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL, FastEngine
 from ..wavefront.psf.long_exposure import LongExposureEngine
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .alignment_states import with_active_optics_state
-from .band_focus import refocus
+from .band_focus import refocus, wavelengths_of_band
 from .config import AtmosphereConfig, BandName, Configuration, PsfConfig, ReconstructionConfig
 from .config_checks import WEIGHT_PIXELS, check_combinations
 from .dispersion import with_dispersion_corrected
@@ -43,7 +43,6 @@ from .resolved_values import resolved_value
 from .simulate.photometry import PROVISIONAL_FWHM, limiting_magnitude, saturation_magnitude
 from .simulate.screen_cover import check_screens, corner_fields
 
-_WAVELENGTHS = 5
 #: Name that stands for the CCDs in the middle of the field.
 CENTRAL = "central"
 #: Largest number of CCDs of a camera that is computed whole by default.
@@ -140,7 +139,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
         )
     wavelengths = config.wavelengths_nm
     if wavelengths is None:
-        wavelengths = tuple(round(float(w) * 1e9, 3) for w in np.linspace(*ends, _WAVELENGTHS))
+        wavelengths = tuple(round(float(w) * 1e9, 3) for w in wavelengths_of_band(ends))
     psf = _with_defaults(
         config.psf,
         (_WITH_ATMOSPHERE | _pupil_points(config.psf, telescope) if atmosphere.enabled else _OPTICS_ALONE)

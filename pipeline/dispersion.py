@@ -44,7 +44,7 @@ def air_dispersion(config: Configuration, site: Site) -> np.ndarray | None:
 
 
 def with_dispersion_corrected(telescope: Telescope, config: Configuration, site: Site) -> Telescope:
-    """Return a telescope whose corrector brings the ends of the band together on the axis; others as they are."""
+    """Return a telescope whose corrector brings the outermost wavelengths together on the axis; others as they are."""
     name, shifts = telescope.dispersion_corrector, air_dispersion(config, site)
     if name is None or shifts is None or not shifts.any():
         return telescope

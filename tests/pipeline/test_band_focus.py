@@ -51,7 +51,6 @@ def test_a_detector_behind_a_fold_moves_along_its_normal():
         pachon.spots(model, np.deg2rad([[0.0, 0.05]]), experiment.wavelengths).rms_radius[0] * 1e6
         for model in (pachon.load_telescope("auxtel"), experiment.telescope)
     )
-    assert before > 9.3
-    assert after < 7.7
+    assert after < 0.85 * before
     moved = {"Detector.dy_um": 1.0}
     assert resolved("auxtel", band="y", changes=moved).config.changes == moved

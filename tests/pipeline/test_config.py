@@ -137,7 +137,10 @@ def test_screens_that_are_too_coarse_name_key_and_remedy():
 )
 def test_light_and_zero_point_are_those_of_the_band(telescope, band, ends):
     config = Experiment.from_config(Configuration(telescope=telescope, band=band)).config
-    assert [config.wavelengths_nm[0], config.wavelengths_nm[-1]] == pytest.approx(ends, abs=1.0)
+    # The middles of five equal parts of the band.
+    first, second, *_, last = config.wavelengths_nm
+    half = 0.5 * (second - first)
+    assert [first - half, last + half] == pytest.approx(ends, abs=1.0)
     if telescope == "auxtel":
         # One square metre, a throughput of a half, and flat light between the ends.
         assert config.photometry.zero_point == pytest.approx(
@@ -152,8 +155,8 @@ def test_the_default_goes_from_the_centre_to_the_edge_of_the_field():
     assert config.band == "r"
     assert config.ccds == tuple(f"R2{raft}_S1{column}" for raft in "234" for column in "012")
     assert len(config.ccds) == 9
-    # Five equally spaced wavelengths over 545 to 703 nm.
-    assert config.wavelengths_nm == (545.0, 584.5, 624.0, 663.5, 703.0)
+    # Five equally spaced wavelengths over 545 to 703 nm, in the middles of equal parts.
+    assert config.wavelengths_nm == (560.8, 592.4, 624.0, 655.6, 687.2)
     assert (config.stars.truth, config.stars.observed) == (100, 40)
     radius = experiment.field_radius_on_detector
     x, y = experiment.camera.centers[[experiment.camera.ccd_index(n) for n in config.ccds]].T
