@@ -60,7 +60,8 @@ def camera_command(
 ) -> None:
     """List and draw the CCDs of a camera; or show statistics of their heights, by vendor, and draw a map of them.
 
-    Heights are along +z of the telescope frame, the direction of the light at the detector.
+    Heights are along +z of the detector: with the light in the LSST, DECam and HSC, against it behind the primary
+    mirror of a Cassegrain.
 
     **Examples**
 

@@ -101,7 +101,7 @@ class PointingConfig(Section):
 class MotionConfig(Section):
     """Motion of a raft or CCD as a rigid body."""
 
-    dz_um: Real = Field(0.0, description="along +z, towards the sky [um]")
+    dz_um: Real = Field(0.0, description="along +z of the detector [um]")
     rx_urad: Real = Field(0.0, description="about x; positive lifts the side at larger y [urad]")
     ry_urad: Real = Field(0.0, description="about y; positive lowers the side at larger x [urad]")
 

@@ -75,7 +75,7 @@ def _draw_map(axes: Axes, focal_plane: FocalPlane, bound: float) -> None:
     draw_outlines(axes, camera, range(len(camera)), "0.5", 0.3)
     frame_axes(axes, extent)
     bar = axes.figure.colorbar(image, ax=axes, fraction=0.045, pad=0.02, extend="both")
-    bar.set_label("height along +z, the direction of the light [µm]")
+    bar.set_label("height along +z of the detector [µm]")
 
 
 def _draw_borders(axes: Axes, camera: Camera) -> None:

@@ -357,7 +357,7 @@ HEIGHT_COLUMNS = (
     "shape [um]",
 )
 HEIGHT_CAPTION = (
-    "Heights along +z, the direction of the light. PV: peak to valley; 95 %: from the 2.5th to the 97.5th percentile, "
+    "Heights along +z of the detector. PV: peak to valley; 95 %: from the 2.5th to the 97.5th percentile, "
     "within a CCD the median over the CCDs. Rms of the CCDs' means, within CCDs, and of the best plane of each CCD "
     "(tilt) and about it (shape). Parts without metrology are left out."
 )
