@@ -226,6 +226,22 @@ def test_noise_in_measured_points_averages_down():
     assert 0.3e-6 < h.std() < 0.6e-6
 
 
+def test_noise_does_not_grow_where_a_ccd_has_no_points():
+    # A weak smoothing alone took 0.2 um to 6 um in the 8 % of the CCD that were not measured.
+    rng = np.random.default_rng(6)
+    x, y = points_on([NAME], rng, 3000)
+    center = CAMERA.centers[CAMERA.ccd_index(NAME)]
+    u, v = (x - center[0]) / HALF[0], (y - center[1]) / HALF[1]
+    z = 4e-6 * (u**2 + v**2)
+    measured = u < 0.84
+    fp = FocalPlane.from_heights(
+        {"x": x[measured], "y": y[measured], "z": (z + rng.normal(0.0, 0.2e-6, x.size))[measured]}
+    )
+    error = fp.height(x, y) - z
+    assert np.std(error[measured]) < 0.07e-6
+    assert np.abs(error).max() < 1e-6
+
+
 @pytest.mark.parametrize(("n", "degree"), [(3, 1), (8, 1), (9, 2), (19, 2), (20, 3), (40, 3)])
 def test_few_points_give_a_polynomial_that_they_support(n, degree):
     rng = np.random.default_rng(n)
