@@ -19,6 +19,8 @@ from ..wavefront.chief_rays import fields_at
 _RINGS = 6
 #: Wavelengths that stand for a band by default.
 _WAVELENGTHS = 5
+#: r of Jee & Tyson (2011) [m].
+_BAND_OF_THE_PAPER = (545e-9, 703e-9)
 #: CCDs from which on their centres sample the field.
 _MANY = 9
 #: Shifts below are none [um].
@@ -27,12 +29,14 @@ _LEAST_UM = 0.5
 _LEAST_PART = 1e-3
 
 
-def wavelengths_of_band(ends: tuple[float, float]) -> np.ndarray:
+def wavelengths_of_band(ends: tuple[float, float], *, dispersed: bool = True) -> np.ndarray:
     """Return the wavelengths that stand for a band by default [m]: the middles of equal parts of it.
 
     From end to end they would have 1.5 times the variance of an even band, and the air would disperse them as much
-    more.
+    more. Jee & Tyson (2011) have theirs from end to end: so has their band where the air does not disperse it.
     """
+    if not dispersed and np.allclose(ends, _BAND_OF_THE_PAPER, rtol=1e-9, atol=0.0):
+        return np.linspace(*ends, _WAVELENGTHS)
     return np.linspace(*ends, 2 * _WAVELENGTHS + 1)[1::2]
 
 

@@ -375,7 +375,7 @@ class Configuration(Section):
     visit: ListedVisitConfig | None = Field(
         None, description="visit of a list, for headers: {number: 1001, mid_mjd: 61001.15, snaps: 1}"
     )
-    wavelengths_nm: tuple[Positive, ...] | None = Field(None, description="wavelengths that make up the band [nm]")
+    wavelengths_nm: tuple[Positive, ...] | None = Field(None, description="wavelengths [nm]; five across the band")
     photometry: PhotometryConfig = PhotometryConfig()
     stars: StarsConfig = StarsConfig()
     focal_plane: FocalPlaneConfig = FocalPlaneConfig()

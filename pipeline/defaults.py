@@ -139,7 +139,8 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
         )
     wavelengths = config.wavelengths_nm
     if wavelengths is None:
-        wavelengths = tuple(round(float(w) * 1e9, 3) for w in wavelengths_of_band(ends))
+        dispersed = atmosphere.enabled and atmosphere.zenith_angle_deg > 0.0
+        wavelengths = tuple(round(float(w) * 1e9, 3) for w in wavelengths_of_band(ends, dispersed=dispersed))
     psf = _with_defaults(
         config.psf,
         (_WITH_ATMOSPHERE | _pupil_points(config.psf, telescope) if atmosphere.enabled else _OPTICS_ALONE)

@@ -155,8 +155,8 @@ def test_the_default_goes_from_the_centre_to_the_edge_of_the_field():
     assert config.band == "r"
     assert config.ccds == tuple(f"R2{raft}_S1{column}" for raft in "234" for column in "012")
     assert len(config.ccds) == 9
-    # Five equally spaced wavelengths over 545 to 703 nm, in the middles of equal parts.
-    assert config.wavelengths_nm == (560.8, 592.4, 624.0, 655.6, 687.2)
+    # Five equally spaced wavelengths over 545 to 703 nm, as in the paper.
+    assert config.wavelengths_nm == (545.0, 584.5, 624.0, 663.5, 703.0)
     assert (config.stars.truth, config.stars.observed) == (100, 40)
     radius = experiment.field_radius_on_detector
     x, y = experiment.camera.centers[[experiment.camera.ccd_index(n) for n in config.ccds]].T
