@@ -122,6 +122,9 @@ def largest_screen_length(diameter: float, screen_size: int) -> float:
 class FastEngine(PsfEngine):
     """Geometric optics for the long waves of the atmosphere, with filters for everything else.
 
+    In exposures that freeze the air, images of pupils below half a metre move too little: rms by 4 % at 0.5 m, 8 % at
+    0.35 m, 17 % at 0.2 m with a Fried parameter of 0.16 m. Their mean width is right, and :class:`WaveEngine` has all.
+
     Attributes
     ----------
     n_pupil : int, optional
