@@ -57,16 +57,16 @@ class PupilOptics:
     displacement: np.ndarray
     #: [n_star, n_wave, n_pupil] m: path to the reference sphere minus that of the chief ray, the negative of the OPD
     path: np.ndarray
-    #: [n_star, n_wave, n_pupil] m: path to spheres through the exit pupil minus that of the chief ray, where it is
-    #: wanted. Its gradient along the pupil is the inverse of the Jacobian times the displacement, out of focus too:
-    #: waves of this phase land where rays do.
-    exit_pupil_path: np.ndarray
     lit: np.ndarray  #: [n_star, n_wave, n_pupil] bool
     jacobian: np.ndarray  #: [n_star, 2, 2] m/rad: detector position by direction cosines of the incoming light
     reference_points: np.ndarray  #: [n_star, 3] m, telescope frame
     reference_cosines: np.ndarray  #: [n_star, 2] direction cosines of the chief rays along x and y of the detector
     fields: np.ndarray  #: [n_star, 2] rad
     wavelengths: np.ndarray  #: [n_wave] m, in vacuum
+    #: [n_star, n_wave, n_pupil] m: path to spheres through the exit pupil minus that of the chief ray, if it is wanted.
+    #: Its gradient along the pupil is the inverse of the Jacobian times the displacement, out of focus too: waves of
+    #: this phase land where rays do.
+    exit_pupil_path: np.ndarray | None = None
 
     def star(self, index: int) -> PupilOptics:
         """Return the optics of one of the stars."""
@@ -74,14 +74,19 @@ class PupilOptics:
 
     def stars(self, index: slice | np.ndarray) -> PupilOptics:
         """Return the optics of some of the stars."""
-        arrays: dict[str, Any] = {name: getattr(self, name)[index] for name in _OF_STARS}
+        arrays: dict[str, Any] = {name: getattr(self, name)[index] for name in self._of_stars}
         return replace(self, **arrays)
 
     @classmethod
     def together(cls, parts: Sequence[PupilOptics]) -> PupilOptics:
         """Return the optics of the stars of all parts, of one pupil and the same wavelengths."""
-        arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _OF_STARS}
+        names = parts[0]._of_stars
+        arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         return replace(parts[0], **arrays)
+
+    @property
+    def _of_stars(self) -> list[str]:
+        return [name for name in _OF_STARS if getattr(self, name) is not None]
 
     @property
     def exit_cosines(self) -> np.ndarray:
@@ -191,7 +196,7 @@ def trace_pupils(
     path = traced_path - chief_path[:, :, None]
     index = float(light[request.middle_index, -3])
     jacobian = image_jacobians(telescope, direction, request.middle, threads)
-    exit_pupil_path = np.broadcast_to(np.nan, path.shape)
+    exit_pupil_path = None
     if exit_pupil:
         exit_pupil_path = ExitPupil(request, index, chief, slopes, jacobian).path(pupil, path, offset)
     if aberration is not None:
@@ -199,7 +204,7 @@ def trace_pupils(
         x, y = pupil.T
         opd = aberration.opd(x, y, request.slopes)[:, None]
         path -= opd
-        if exit_pupil:
+        if exit_pupil_path is not None:
             exit_pupil_path -= opd
         gradient = aberration.gradient(x, y, request.slopes)
         offset -= np.einsum("sij,spj->spi", jacobian, gradient)[:, None]
@@ -207,11 +212,11 @@ def trace_pupils(
         pupil=pupil,
         displacement=offset.astype(np.float32),
         path=path,
-        exit_pupil_path=exit_pupil_path,
         lit=status == RayStatus.OK,
         jacobian=jacobian,
         reference_points=reference_points,
         reference_cosines=(chief.direction @ rotation)[:, :2],
         fields=request.fields,
         wavelengths=waves,
+        exit_pupil_path=exit_pupil_path,
     )

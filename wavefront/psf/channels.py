@@ -80,10 +80,12 @@ class Channels:
 
     def path(self, optics: PupilOptics) -> np.ndarray:
         """Return :attr:`PupilOptics.exit_pupil_path` [m] of the displacements, [n_star, n_channel, n_pupil]."""
+        path = optics.exit_pupil_path
+        assert path is not None
         if not self.shift.any():
-            return optics.exit_pupil_path
+            return path
         square = (optics.exit_cosines**2).sum(axis=-1) - (optics.reference_cosines**2).sum(axis=-1)[:, None]
-        return np.asarray(optics.exit_pupil_path[:, self.wave] - 0.5 * self.shift[:, None] * square[:, None])
+        return np.asarray(path[:, self.wave] - 0.5 * self.shift[:, None] * square[:, None])
 
     def spread(self, k: np.ndarray) -> np.ndarray:
         """Return the transfer function of the further diffusion at wavenumbers [n] [rad/m], shape [n_channel, n]."""

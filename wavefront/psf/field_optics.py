@@ -125,7 +125,6 @@ class FieldOptics:
             pupil=self.pupil,
             displacement=displacement,
             path=np.broadcast_to(np.nan, (n_star, n_wave, n_pupil)),
-            exit_pupil_path=np.broadcast_to(np.nan, (n_star, n_wave, n_pupil)),
             lit=np.repeat(self._lit(edges)[:, None], n_wave, axis=1),
             jacobian=jacobian,
             reference_points=self.telescope.surfaces[-1].to_telescope(reference),

@@ -153,6 +153,7 @@ class LatticeTransfer:
             return out
         pupil, displacement = star_optics.pupil[lit], star_optics.displacement[:, :, lit]
         star_optics = replace(star_optics, pupil=pupil, displacement=displacement)
+        assert star_optics.exit_pupil_path is not None
         path = star_optics.exit_pupil_path[:, :, lit]
         if len(self.wavelengths) > 1:
             path = path + np.einsum("wt,pt->wp", rays.path[star], self._terms(pupil, _DEGREE))
